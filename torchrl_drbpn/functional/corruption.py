@@ -1,0 +1,199 @@
+"""Sample missing entries and noise of an observation, from a generator that the caller owns.
+
+Eq. (2) [DRBPN]: noise falls on the state of the simulator, then entries of the noisy complete
+observation go missing, completely at random (MCAR), at random given what always arrives (MAR), or not
+at random (NMAR). The terms are those of Rubin, "Inference and missing data", Biometrika 1976.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import linear
+
+MissingnessKind = Literal["mcar", "mar", "nmar"]
+
+
+class MissingnessMechanism(NamedTuple):
+    """The fixed parameters of a MAR or NMAR mechanism.
+
+    Attributes:
+        always_observed: bool, shape `(obs,)`; True where an entry never goes missing.
+        bias: b0, shape `(obs,)`; minus infinity where `always_observed`, so that the probability
+            there is exactly 0.
+        observation_weight: b2, shape `(obs, obs)`, row i for entry i, per observation unit; under MAR
+            the columns outside `always_observed` are 0.
+        action_weight: b1, shape `(obs, action)`, per action unit.
+    """
+
+    always_observed: Tensor
+    bias: Tensor
+    observation_weight: Tensor
+    action_weight: Tensor
+
+
+def count_always_observed(obs_dim: int, share: float) -> int:
+    """Return how many of `obs_dim` entries always arrive: round(share * obs_dim), at least 1.
+
+    Args:
+        obs_dim: number of entries.
+        share: share of them that always arrives, in [0, 1].
+
+    Returns:
+        The number; a tie goes to the even neighbour, as in Python's `round`.
+
+    >>> count_always_observed(17, 0.25), count_always_observed(2, 0.1)
+    (4, 1)
+    """
+    return max(1, round(share * obs_dim))
+
+
+def draw_mechanism(
+    kind: Literal["mar", "nmar"],
+    obs_dim: int,
+    action_dim: int,
+    *,
+    always_observed: float = 0.25,
+    generator: torch.Generator,
+) -> MissingnessMechanism:
+    """Draw the always observed entries and b0, b1, b2 ~ N(0, 1) of a mechanism.
+
+    MAR and NMAR draw the same numbers from the same generator state, and the action's weights come
+    last, so that all else does not depend on the number of actions.
+
+    Args:
+        kind: "mar" or "nmar".
+        obs_dim: number of entries of the observation.
+        action_dim: number of entries of the action; 0 leaves the action out.
+        always_observed: share of the entries that always arrive, in [0, 1].
+        generator: a CPU generator.
+
+    Returns:
+        The mechanism, float64 on the CPU.
+
+    Raises:
+        ValueError: if `kind` is neither or `always_observed` lies outside [0, 1].
+
+    Example:
+        >>> draw = lambda: draw_mechanism("mar", 8, 3, generator=torch.Generator().manual_seed(0))
+        >>> int(draw().always_observed.sum()), torch.equal(draw().bias, draw().bias)
+        (2, True)
+    """
+    if kind not in ("mar", "nmar"):
+        raise ValueError(f'`kind` must be "mar" or "nmar", got {kind!r}; "mcar" has no parameters.')
+    if not 0.0 <= always_observed <= 1.0:
+        raise ValueError(
+            f"`always_observed` must be a share in [0, 1], got {always_observed}. "
+            "It is the part of the entries that never goes missing."
+        )
+    count = count_always_observed(obs_dim, always_observed)
+    always = torch.zeros(obs_dim, dtype=torch.bool)
+    always[torch.randperm(obs_dim, generator=generator)[:count]] = True
+    bias = torch.randn(obs_dim, generator=generator, dtype=torch.float64)
+    observation_weight = torch.randn(obs_dim, obs_dim, generator=generator, dtype=torch.float64)
+    action_weight = torch.randn(obs_dim, action_dim, generator=generator, dtype=torch.float64)
+    if kind == "mar":
+        observation_weight = observation_weight.masked_fill(~always, 0.0)
+    return MissingnessMechanism(
+        always, bias.masked_fill(always, -math.inf), observation_weight, action_weight
+    )
+
+
+def missing_probability(
+    mechanism: MissingnessMechanism,
+    observation: Tensor,
+    previous_action: Tensor | None,
+    eta: float,
+) -> Tensor:
+    r"""Return the probability that each entry goes missing.
+
+    $P(\text{missing}_i) = \min(\sigma(b_{1i}^\top a_{t-1} + b_{2i}^\top x + b_{0i}), \eta)$, and 0 for
+    the always observed entries (experiments of [DRBPN]); under MAR x stands for the always observed
+    entries alone. It realises clearly less than eta.
+
+    Args:
+        mechanism: parameters, on the device and in the dtype of `observation`.
+        observation: complete observation as it arrives (noise included), shape `(*batch, obs)`.
+        previous_action: a_{t-1}, shape `(*batch, action)`; None counts as zero, as at the first step
+            of an episode.
+        eta: upper bound of the probability.
+
+    Returns:
+        Probabilities, shape `(*batch, obs)`.
+
+    Example:
+        >>> g = torch.Generator().manual_seed(0)
+        >>> m = draw_mechanism("nmar", 4, 2, generator=g)
+        >>> p = missing_probability(m, torch.randn(7, 4).double(), torch.zeros(7, 2).double(), 0.3)
+        >>> p.shape, bool((p[:, m.always_observed] == 0).all()), bool((p <= 0.3).all())
+        (torch.Size([7, 4]), True, True)
+    """
+    logits = linear(observation, mechanism.observation_weight, mechanism.bias)
+    if previous_action is not None:
+        logits = logits + linear(previous_action, mechanism.action_weight)
+    return logits.sigmoid().clamp(max=eta)
+
+
+def sample_observed(
+    probability: Tensor | float, like: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Draw which entries arrive, each one missing with its probability, independently.
+
+    Args:
+        probability: of being missing; a number for all (MCAR) or shape `(*batch, obs)`.
+        like: a tensor of shape `(*batch, obs)` on the generator's device.
+        generator: source of randomness.
+
+    Returns:
+        bool, shape `(*batch, obs)`, True where an entry arrives. The same generator state gives the
+        same mask whatever the dtype of `like`.
+
+    Example:
+        >>> x = torch.zeros(3, 5)
+        >>> bool(sample_observed(0.0, x, torch.Generator()).all())
+        True
+        >>> bool(sample_observed(1.0, x, torch.Generator()).any())
+        False
+    """
+    uniform = torch.rand(like.shape, generator=generator, device=like.device)
+    # uniform < 1, so that probability 1 always misses; and where the probability is NaN, from a NaN
+    # in the observation, the entry arrives: a mask must not hide that the simulation broke down
+    return (uniform < probability).logical_not_()
+
+
+def sample_noise(std: Tensor | float, like: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw zero-mean Gaussian noise with standard deviation `std`.
+
+    Args:
+        std: standard deviation in observation units; a number or shape `(obs,)`.
+        like: a tensor of shape `(*batch, obs)` on the generator's device.
+        generator: source of randomness.
+
+    Returns:
+        Noise with the shape and dtype of `like`.
+
+    Example:
+        >>> sample_noise(0.0, torch.ones(2, 3), torch.Generator()).abs().sum().item()
+        0.0
+    """
+    noise = torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
+    return noise.mul_(std)
+
+
+def mask_observation(observation: Tensor, observed: Tensor) -> Tensor:
+    """Return `observation` with 0 where `observed` is False, whatever lies beneath, NaN included.
+
+    Args:
+        observation: shape `(*batch, obs)`.
+        observed: bool, shape `(*batch, obs)`.
+
+    Returns:
+        Shape and dtype of `observation`.
+
+    >>> mask_observation(torch.tensor([1.0, float("nan")]), torch.tensor([True, False])).tolist()
+    [1.0, 0.0]
+    """
+    return torch.where(observed, observation, 0.0)

@@ -1,0 +1,537 @@
+"""A whole sequence through the belief filter: fast forms, and the generic loop behind them.
+
+Three ways give the same numbers; :func:`filter_sequence` chooses:
+
+- *innovation form* (constant Q): factorises obs x obs, A = M (H Q H' + R) M' for every mask of the
+  minibatch in one batched call; any R;
+- *information form* (constant Q, diagonal R): factorises state x state,
+  inv(cov) = inv(Q) + sum_i m_i / r_i h_i h_i'; the cheaper one where obs exceeds state;
+- *loop*: :mod:`.kalman` at every step, for any transition and for a Q that depends on the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional.gaussian import LOG_2PI, Belief, masked_cov, zero_missing
+from torchrl_drbpn.functional.kalman import log_likelihood, update
+from torchrl_drbpn.functional.recurrence import (
+    InformationRecurrence,
+    InnovationRecurrence,
+    MeanNetwork,
+)
+
+__all__ = [
+    "FilterOutput",
+    "Form",
+    "StateSpace",
+    "StateSpace",
+    "choose_form",
+    "filter_sequence",
+    "filter_step",
+    "filtered_cov",
+    "predict_step",
+]
+
+Form = Literal["auto", "innovation", "information", "loop"]
+
+
+class StateSpace(NamedTuple):
+    r"""Hold the tensors of a linear-Gaussian-emission state-space model (eq. 2, 3, 8 [DRBPN]).
+
+    .. math::
+        s_t = f(s_{t-1}, a_{t-1}) + N(0, Q), \qquad
+        x_t = H s_t + B a_{t-1} + d + N(0, R), \qquad
+        s_1 \sim N(m_0, P_0)
+
+    Args:
+        transition: f; a :class:`MeanNetwork` opens the fast forms, any callable of
+            (mean, action) goes through the loop.
+        transition_cov: Q, shape ``(state, state)``, or a callable of (mean, action) that returns
+            ``(*batch, state, state)``.
+        emission_matrix: H, shape ``(obs, state)``.
+        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for the variances of a diagonal R.
+        action_matrix: B, shape ``(obs, action)``.
+        emission_offset: d, shape ``(obs,)``.
+        initial_mean: m_0, shape ``(state,)``.
+        initial_cov: P_0, shape ``(state, state)``.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(
+        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     torch.zeros(2), eye)
+        >>> model.full_emission_cov().shape
+        torch.Size([2, 2])
+    """
+
+    transition: MeanNetwork | Callable[[Tensor, Tensor], Tensor]
+    transition_cov: Tensor | Callable[[Tensor, Tensor], Tensor]
+    emission_matrix: Tensor
+    emission_cov: Tensor
+    action_matrix: Tensor
+    emission_offset: Tensor
+    initial_mean: Tensor
+    initial_cov: Tensor
+
+    def full_emission_cov(self) -> Tensor:
+        """Return R as a matrix, shape ``(obs, obs)``."""
+        return self.emission_cov.diag() if self.emission_cov.ndim == 1 else self.emission_cov
+
+    def offset(self, previous_action: Tensor) -> Tensor:
+        """Return B a + d, shape ``(*batch, obs)``."""
+        return torch.nn.functional.linear(previous_action, self.action_matrix, self.emission_offset)
+
+
+class FilterOutput(NamedTuple):
+    """Hold what the filter returns.
+
+    Args:
+        mean: filtered mean, shape ``(*batch, [time,] state)``.
+        cov: filtered covariance, shape ``(*batch, [time,] state, state)``; None where not asked
+            for.
+        log_likelihood: of each step, shape ``(*batch, [time])``, nats.
+
+    Example:
+        >>> import torch
+        >>> out = FilterOutput(torch.zeros(2), None, torch.zeros(()))
+        >>> out.cov is None
+        True
+    """
+
+    mean: Tensor
+    cov: Tensor | None
+    log_likelihood: Tensor
+
+
+def choose_form(model: StateSpace) -> Literal["innovation", "information", "loop"]:
+    """Choose the cheapest exact form of a model.
+
+    Args:
+        model: the state-space model.
+
+    Returns:
+        "loop" unless the transition is a :class:`MeanNetwork` with a constant Q; otherwise
+        "information" where R is diagonal and obs exceeds state, else "innovation".
+
+    Example:
+        >>> import torch
+        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
+        >>> eye, H = torch.eye(2), torch.zeros(9, 2)
+        >>> model = StateSpace(f, eye, H, torch.ones(9), torch.zeros(9, 1), torch.zeros(9),
+        ...                    torch.zeros(2), eye)
+        >>> choose_form(model), choose_form(model._replace(emission_cov=torch.eye(9)))
+        ('information', 'innovation')
+    """
+    if not isinstance(model.transition_cov, Tensor) or not isinstance(
+        model.transition, MeanNetwork
+    ):
+        return "loop"
+    obs, state = model.emission_matrix.shape
+    return "information" if model.emission_cov.ndim == 1 and obs > state else "innovation"
+
+
+def _checked_form(model: StateSpace, form: Form) -> str:
+    best = choose_form(model)
+    if form == "auto":
+        return best
+    if form not in ("innovation", "information", "loop"):
+        raise ValueError(
+            f"`form` must be 'auto', 'innovation', 'information' or 'loop', got {form!r}."
+        )
+    if best == "loop" and form != "loop":
+        raise ValueError(
+            f"`form` {form!r} needs a MeanNetwork transition with a constant transition_cov; "
+            "this model has a transition or covariance of another kind: use form='loop'."
+        )
+    if form == "information" and model.emission_cov.ndim != 1:
+        raise ValueError(
+            "`form` 'information' needs a diagonal emission covariance (variances of shape (obs,)),"
+            f" got a full one of shape {tuple(model.emission_cov.shape)}: use form='innovation'."
+        )
+    return form
+
+
+def _initial(model: StateSpace, reset: Tensor, mean: Tensor, cov: Tensor) -> Belief:
+    """Put the initial belief where an episode starts. reset: (*batch, 1)."""
+    return Belief(
+        torch.where(reset, model.initial_mean, mean),
+        torch.where(reset.unsqueeze(-1), model.initial_cov, cov),
+    )
+
+
+def predict_step(
+    model: StateSpace, mean: Tensor, previous_action: Tensor, reset: Tensor
+) -> Belief:
+    r"""Predict one step, or start an episode from the initial belief.
+
+    .. math:: m^- = f(m, a), \; P^- = Q; \qquad \text{at a reset } m^- = m_0, \; P^- = P_0
+
+    Eq. (8) [DRBPN].
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before, shape ``(*batch, state)``.
+        previous_action: shape ``(*batch, action)``.
+        reset: bool, shape ``(*batch,)``.
+
+    Returns:
+        The predicted belief.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(
+        ...     lambda m, a: m + 1, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     torch.zeros(2), eye)
+        >>> reset = torch.tensor([True, False])
+        >>> predict_step(model, torch.ones(2, 2), torch.zeros(2, 1), reset).mean.tolist()
+        [[0.0, 0.0], [2.0, 2.0]]
+    """
+    cov = model.transition_cov
+    if not isinstance(cov, Tensor):
+        cov = cov(mean, previous_action)
+    return _initial(model, reset.unsqueeze(-1), model.transition(mean, previous_action), cov)
+
+
+def filter_step(
+    model: StateSpace,
+    mean: Tensor,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    *,
+    return_cov: bool = False,
+    form: Form = "auto",
+) -> FilterOutput:
+    """Filter one step for any batch of beliefs.
+
+    Eq. (8), (10), (12) [DRBPN].
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before, shape ``(*batch, state)``.
+        previous_action: shape ``(*batch, action)``.
+        observation: shape ``(*batch, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, obs)``.
+        reset: bool, shape ``(*batch,)``; True starts from the initial belief.
+
+    Keyword Args:
+        return_cov: whether the filtered covariance is wanted.
+        form: see :func:`filter_sequence`.
+
+    Returns:
+        :class:`FilterOutput` of shapes ``(*batch, ...)``.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(
+        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     torch.zeros(2), eye)
+        >>> nothing = torch.zeros(5, 2, dtype=torch.bool)
+        >>> out = filter_step(model, torch.ones(5, 2), torch.zeros(5, 1), torch.zeros(5, 2),
+        ...                   nothing, torch.zeros(5, dtype=torch.bool))
+        >>> bool((out.mean == 1).all()), bool((out.log_likelihood == 0).all())
+        (True, True)
+    """
+    predicted = predict_step(model, mean, previous_action, reset)
+    H, offset = model.emission_matrix, model.offset(previous_action)
+    if _checked_form(model, form) == "loop":
+        R = model.full_emission_cov()
+        filtered = update(predicted, observation, observed, H, R, offset)
+        ll = log_likelihood(predicted, observation, observed, H, R, offset)
+        return FilterOutput(filtered.mean, filtered.cov if return_cov else None, ll)
+
+    # Constant Q: the innovation covariances exist twice only, for ordinary and for first steps.
+    m = predicted.mean
+    residual = zero_missing(zero_missing(observation, observed) - (offset + m @ H.mT), observed)
+    row = reset.unsqueeze(-1)
+    if _checked_form(model, form) == "information":
+        weight = observed / model.emission_cov
+        precision, log_det_prior = _precision(model, weight, row)
+        factor = torch.linalg.cholesky(precision)
+        pull = (weight * residual) @ H
+        step = torch.cholesky_solve(pull.unsqueeze(-1), factor).squeeze(-1)
+        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + log_det_prior
+        ll = _information_likelihood(model, step, residual, weight, observed, log_det, row)
+    else:
+        Q = model.transition_cov
+        assert isinstance(Q, Tensor)  # noqa: S101 - narrowed by choose_form, for the type checker
+        R = model.full_emission_cov()
+        cross, initial_cross = Q @ H.mT, model.initial_cov @ H.mT
+        S = torch.where(row.unsqueeze(-1), H @ initial_cross + R, H @ cross + R)
+        factor = torch.linalg.cholesky(masked_cov(S, observed))
+        z = torch.cholesky_solve(residual.unsqueeze(-1), factor).squeeze(-1)
+        step = torch.where(row, z @ initial_cross.mT, z @ cross.mT)
+        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        count = observed.sum(-1).to(m.dtype)
+        ll = -0.5 * ((z * residual).sum(-1) + log_det + count * LOG_2PI)
+    ll = torch.where(observed.any(-1), ll, 0.0)
+    cov = filtered_cov(model, observed, reset) if return_cov else None
+    return FilterOutput(m + step, cov, ll)
+
+
+def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
+    r"""Return the filtered covariance of a constant-Q model; it depends on the masks alone.
+
+    .. math:: P^+ = (I - K H) P (I - K H)' + K R K'
+
+    Eq. (10) [DRBPN] in Joseph's form; P is Q, or P_0 where an episode starts.
+
+    Args:
+        model: the state-space model, its transition_cov a tensor.
+        observed: bool, shape ``(*batch, obs)``.
+        reset: bool, shape ``(*batch,)``.
+
+    Returns:
+        Shape ``(*batch, state, state)``, symmetric positive definite.
+
+    Raises:
+        ValueError: if transition_cov depends on the state.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(
+        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     torch.zeros(2), eye)
+        >>> seen = torch.tensor([True, False])
+        >>> filtered_cov(model, seen, torch.tensor(False)).tolist()
+        [[0.5, 0.0], [0.0, 1.0]]
+    """
+    if not isinstance(model.transition_cov, Tensor):
+        raise ValueError(
+            "`transition_cov` depends on the state here, so the covariance depends on the whole "
+            "past: ask filter_sequence or filter_step for it with return_cov=True."
+        )
+    zeros = torch.zeros_like(model.initial_mean).expand(*reset.shape, -1)
+    prior = _initial(model, reset.unsqueeze(-1), zeros, model.transition_cov)
+    nothing = torch.zeros((), dtype=zeros.dtype, device=zeros.device).expand(observed.shape)
+    H, R = model.emission_matrix, model.full_emission_cov()
+    return update(prior, nothing, observed, H, R).cov
+
+
+def filter_sequence(
+    model: StateSpace,
+    mean: Tensor,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    *,
+    restart: Tensor | None = None,
+    restart_mean: Tensor | None = None,
+    return_cov: bool = False,
+    form: Form = "auto",
+) -> FilterOutput:
+    """Filter whole sequences, episode starts inside them included.
+
+    Eq. (8), (10), (12) [DRBPN] at every step. The fast forms equal the loop in values and
+    gradients; their own gradients cannot be differentiated again.
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
+        previous_action: shape ``(*batch, time, action)``.
+        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, time, obs)``.
+        reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
+
+    Keyword Args:
+        restart: bool, shape ``(*batch, time)``; True takes the belief of the step before from
+            ``restart_mean`` instead of from the sequence.
+        restart_mean: shape ``(*batch, time, state)``; read where ``restart`` is True.
+        return_cov: whether the filtered covariances are wanted.
+        form: "auto" chooses by dimension (:func:`choose_form`); "innovation", "information" and
+            "loop" force one.
+
+    Returns:
+        :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
+
+    Raises:
+        ValueError: if the asked form does not fit the model.
+
+    Example:
+        >>> import torch
+        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...                    torch.zeros(2), eye)
+        >>> seen = torch.rand(4, 10, 2) < 0.7
+        >>> out = filter_sequence(model, torch.zeros(4, 2), torch.zeros(4, 10, 1),
+        ...                       torch.randn(4, 10, 2), seen, torch.zeros(4, 10, dtype=torch.bool))
+        >>> out.mean.shape, out.log_likelihood.shape
+        (torch.Size([4, 10, 2]), torch.Size([4, 10]))
+    """
+    chosen = _checked_form(model, form)
+    batch, time = reset.shape[:-1], reset.shape[-1]
+    mean = mean.expand(*batch, mean.shape[-1])
+
+    def time_major(x: Tensor) -> Tensor:
+        """[*batch, time, dim] -> [time, batch, dim]."""
+        return x.reshape(-1, time, x.shape[-1]).transpose(0, 1)
+
+    def batch_major(x: Tensor) -> Tensor:
+        return x.transpose(0, 1).reshape(*batch, time, *x.shape[2:])
+
+    # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
+    x, a, seen = (time_major(v) for v in (zero_missing(observation, observed), previous_action, observed))
+    first = time_major(reset.unsqueeze(-1))
+    again = None if restart is None else time_major(restart.unsqueeze(-1))
+    stored = None if restart_mean is None else time_major(restart_mean)
+    start = mean.reshape(-1, mean.shape[-1])
+
+    if chosen == "loop":
+        filtered, cov, ll = _loop(model, start, a, x, seen, first, again, stored)
+        return FilterOutput(
+            batch_major(filtered), batch_major(cov) if return_cov else None, batch_major(ll)
+        )
+    run = _innovation if chosen == "innovation" else _information
+    filtered, ll = run(model, start, a, x, seen, first, again, stored)
+    ll = torch.where(seen.any(-1), ll, 0.0)
+    covs = filtered_cov(model, observed, reset) if return_cov else None
+    return FilterOutput(batch_major(filtered), covs, batch_major(ll))
+
+
+def _loop(
+    model: StateSpace,
+    mean: Tensor,
+    action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    restart: Tensor | None,
+    stored: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Run :mod:`.kalman` step by step, time-major; any transition, any covariance."""
+    H, R = model.emission_matrix, model.full_emission_cov()
+    offset = model.offset(action)
+    means, covs, lls = [], [], []
+    for t in range(len(action)):
+        if restart is not None and stored is not None:
+            mean = torch.where(restart[t], stored[t], mean)
+        predicted = predict_step(model, mean, action[t], reset[t].squeeze(-1))
+        filtered = update(predicted, observation[t], observed[t], H, R, offset[t])
+        lls.append(log_likelihood(predicted, observation[t], observed[t], H, R, offset[t]))
+        mean = filtered.mean
+        means.append(mean)
+        covs.append(filtered.cov)
+    return torch.stack(means), torch.stack(covs), torch.stack(lls)
+
+
+def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, list[Tensor]]:
+    """Split the first layer: its action part for all steps at once, its weights on the mean."""
+    f = model.transition
+    assert isinstance(f, MeanNetwork)  # noqa: S101 - narrowed by choose_form, for the type checker
+    state = model.emission_matrix.shape[-1]
+    drive = torch.nn.functional.linear(action, f.weights[0][:, state:], f.biases[0])
+    rest = [p for pair in zip(f.weights[1:], f.biases[1:], strict=True) for p in pair]
+    return f, drive, [f.weights[0][:, :state], *rest]
+
+
+def _innovation(
+    model: StateSpace,
+    start: Tensor,
+    action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    restart: Tensor | None,
+    stored: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    f, drive, weights = _network(model, action)
+    H, Q, R = model.emission_matrix, model.transition_cov, model.full_emission_cov()
+    assert isinstance(Q, Tensor)  # noqa: S101 - narrowed by choose_form, for the type checker
+    cross, initial_cross = Q @ H.mT, model.initial_cov @ H.mT
+    y = zero_missing(observation - model.offset(action), observed)
+    _, mean, ll = InnovationRecurrence.apply(
+        f.residual, f.activation, y, observed, reset, restart, stored, start, drive,
+        model.initial_mean, H, H @ cross + R, H @ initial_cross + R, cross, initial_cross, *weights,
+    )  # fmt: skip
+    return mean, ll - (0.5 * LOG_2PI) * observed.sum(-1).to(ll.dtype)
+
+
+def _precision(model: StateSpace, weight: Tensor, reset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return inv(P) + sum_i w_i h_i h_i' and log|P|, P of the step (Q, or P_0 at a reset)."""
+    gathered = _gathered(model, weight)
+    prior, log_det = _prior_precision(model)
+    at_reset = reset.squeeze(-1)
+    both = torch.where(reset.unsqueeze(-1), prior[1], prior[0])
+    return gathered + both, torch.where(at_reset, log_det[1], log_det[0])
+
+
+def _prior_precision(model: StateSpace) -> tuple[Tensor, Tensor]:
+    """Return the inverses and log-determinants of (Q, P_0): two small matrices a call."""
+    Q = model.transition_cov
+    assert isinstance(Q, Tensor)  # noqa: S101 - narrowed by choose_form, for the type checker
+    factor = torch.linalg.cholesky(torch.stack([Q, model.initial_cov]))
+    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return torch.cholesky_inverse(factor), log_det
+
+
+def _gathered(model: StateSpace, weight: Tensor) -> Tensor:
+    """Return N = sum_i w_i h_i h_i' for every step: one matrix product over all of them."""
+    H = model.emission_matrix
+    state = H.shape[-1]
+    outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
+    return (weight @ outer).unflatten(-1, (state, state))
+
+
+def _information_likelihood(
+    model: StateSpace,
+    step: Tensor,
+    residual: Tensor,
+    weight: Tensor,
+    observed: Tensor,
+    log_det: Tensor,
+    reset: Tensor,
+) -> Tensor:
+    r"""Evaluate eq. (12) [DRBPN] without an obs x obs matrix.
+
+    .. math::
+        v' S^{-1} v = (v - H \delta)' W (v - H \delta) + \delta' P^{-1} \delta, \qquad
+        \log|S| = \textstyle\sum_i m_i \log r_i + \log|P| + \log|P^{-1} + H' W H|
+
+    with :math:`\delta = m^+ - m^-` and W = diag(m / r). Both terms of the quadratic form are sums
+    of squares, so nothing cancels in float32 when R is small.
+    """
+    fit = residual - observed * (step @ model.emission_matrix.mT)
+    prior, _ = _prior_precision(model)
+    by_prior = torch.where(reset, step @ prior[1], step @ prior[0])
+    quadratic = (weight * fit.square()).sum(-1) + (step * by_prior).sum(-1)
+    log_noise = observed.to(step.dtype) @ (model.emission_cov.log() + LOG_2PI)
+    return -0.5 * (quadratic + log_noise + log_det)
+
+
+def _information(
+    model: StateSpace,
+    start: Tensor,
+    action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    restart: Tensor | None,
+    stored: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    f, drive, weights = _network(model, action)
+    H = model.emission_matrix
+    y = zero_missing(observation - model.offset(action), observed)
+    weight = observed / model.emission_cov
+    gathered = _gathered(model, weight)
+    prior, log_det_prior = _prior_precision(model)
+    precision = gathered + torch.where(reset.unsqueeze(-1), prior[1], prior[0])
+    m, mean, log_det = InformationRecurrence.apply(
+        f.residual, f.activation, precision, gathered, (weight * y) @ H, reset, restart, stored,
+        start, drive, model.initial_mean, *weights,
+    )  # fmt: skip
+    residual = zero_missing(y - m @ H.mT, observed)
+    log_det = log_det + torch.where(reset.squeeze(-1), log_det_prior[1], log_det_prior[0])
+    ll = _information_likelihood(model, mean - m, residual, weight, observed, log_det, reset)
+    return mean, ll

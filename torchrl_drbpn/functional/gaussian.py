@@ -1,0 +1,198 @@
+"""Gaussian beliefs: the pair (mean, cov), the masked log-density, covariance parametrisations."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+__all__ = [
+    "Belief",
+    "full_cov",
+    "inverse_softplus",
+    "masked_cov",
+    "masked_log_density",
+    "positive_std",
+    "tril_to_vector",
+    "zero_missing",
+]
+
+LOG_2PI = math.log(2.0 * math.pi)
+
+
+class Belief(NamedTuple):
+    """Hold a Gaussian belief N(mean, cov).
+
+    Args:
+        mean: shape ``(*batch, dim)``.
+        cov: shape ``(*batch, dim, dim)``, symmetric positive definite.
+
+    Example:
+        >>> import torch
+        >>> belief = Belief(torch.zeros(3), torch.eye(3))
+        >>> belief.mean.shape, belief.cov.shape
+        (torch.Size([3]), torch.Size([3, 3]))
+    """
+
+    mean: Tensor
+    cov: Tensor
+
+
+def zero_missing(values: Tensor, observed: Tensor) -> Tensor:
+    """Put 0 where nothing arrived, whatever stood there (NaN and inf included).
+
+    Uses ``torch.where``: multiplying by the mask would keep a NaN (0 * NaN = NaN), and its
+    gradient is zero at the missing entries.
+
+    Args:
+        values: shape ``(*batch, obs)``.
+        observed: bool, shape ``(*batch, obs)``, True = arrived.
+
+    Returns:
+        Tensor of the shape of ``values``.
+
+    Example:
+        >>> import torch
+        >>> zero_missing(torch.tensor([1.0, float("nan")]), torch.tensor([True, False])).tolist()
+        [1.0, 0.0]
+    """
+    return torch.where(observed, values, torch.zeros((), dtype=values.dtype, device=values.device))
+
+
+def masked_cov(cov: Tensor, observed: Tensor) -> Tensor:
+    r"""Replace the rows and columns of missing entries by those of the identity.
+
+    .. math:: A = (m m') \circ S + \mathrm{diag}(1 - m)
+
+    The determinant of A and its inverse on the observed block are those of the sub-matrix
+    ``M S M'`` (eq. 10 and 12 [DRBPN]), with a static shape.
+
+    Args:
+        cov: S, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
+        observed: bool, shape ``(*batch, obs)``.
+
+    Returns:
+        A, shape ``(*batch, obs, obs)``.
+
+    Example:
+        >>> import torch
+        >>> cov = torch.tensor([[2.0, 1.0], [1.0, 2.0]])
+        >>> masked_cov(cov, torch.tensor([True, False])).tolist()
+        [[2.0, 0.0], [0.0, 1.0]]
+    """
+    both = observed.unsqueeze(-1) & observed.unsqueeze(-2)
+    eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
+    return torch.where(both, cov, eye)
+
+
+def masked_log_density(residual: Tensor, cov: Tensor, observed: Tensor) -> Tensor:
+    r"""Evaluate log N(M residual; 0, M cov M') with M selecting the observed entries.
+
+    .. math:: \log p = -\tfrac12 \left( r' A^{-1} r + \log|A| + n \log 2\pi \right)
+
+    Eq. (12) [DRBPN]. A is :func:`masked_cov`, n the number of observed entries. With nothing
+    observed the value is exactly 0.
+
+    Args:
+        residual: shape ``(*batch, obs)``; what stands at missing entries is ignored.
+        cov: shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
+        observed: bool, shape ``(*batch, obs)``.
+
+    Returns:
+        Shape ``(*batch,)``, nats.
+
+    Example:
+        >>> import torch
+        >>> nothing = torch.zeros(2, dtype=torch.bool)
+        >>> masked_log_density(torch.ones(2), torch.eye(2), nothing).item()
+        0.0
+    """
+    residual = zero_missing(residual, observed)
+    factor = torch.linalg.cholesky(masked_cov(cov, observed))
+    white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    count = observed.sum(-1).to(residual.dtype)
+    return -0.5 * (white.square().sum(-1) + log_det + count * LOG_2PI)
+
+
+def inverse_softplus(value: Tensor) -> Tensor:
+    """Return x with softplus(x) = value, for value > 0.
+
+    Args:
+        value: positive, any shape.
+
+    Returns:
+        Tensor of the same shape.
+
+    Example:
+        >>> import torch
+        >>> x = torch.tensor([1e-4, 0.3, 50.0], dtype=torch.float64)
+        >>> torch.allclose(torch.nn.functional.softplus(inverse_softplus(x)), x)
+        True
+    """
+    return value + torch.log(-torch.expm1(-value))
+
+
+def positive_std(raw: Tensor, min_std: float) -> Tensor:
+    """Map free numbers to standard deviations that never fall under a floor.
+
+    ``std = min_std + softplus(raw)``. The floor bounds the likelihood from above.
+
+    Args:
+        raw: any shape.
+        min_std: floor, in the units of the quantity.
+
+    Returns:
+        Tensor of the same shape, every entry at least ``min_std``.
+
+    Example:
+        >>> import torch
+        >>> bool((positive_std(torch.tensor([-1e3, 0.0]), 0.1) >= 0.1).all())
+        True
+    """
+    return softplus(raw) + min_std
+
+
+def full_cov(raw: Tensor, min_std: float) -> Tensor:
+    """Map a free square matrix to a covariance L L' + min_std**2 I.
+
+    L is the lower triangle of ``raw`` with a softplus diagonal, so that the smallest eigenvalue
+    is never under ``min_std**2``.
+
+    Args:
+        raw: shape ``(*batch, dim, dim)``; its upper triangle is not read.
+        min_std: floor of the standard deviation in every direction.
+
+    Returns:
+        Shape ``(*batch, dim, dim)``, symmetric positive definite.
+
+    Example:
+        >>> import torch
+        >>> cov = full_cov(torch.randn(4, 4, dtype=torch.float64), 0.1)
+        >>> bool(torch.linalg.eigvalsh(cov).min() >= 0.01 - 1e-12)
+        True
+    """
+    tril = raw.tril(-1) + torch.diag_embed(softplus(raw.diagonal(dim1=-2, dim2=-1)))
+    eye = torch.eye(raw.shape[-1], dtype=raw.dtype, device=raw.device)
+    return tril @ tril.mT + (min_std * min_std) * eye
+
+
+def tril_to_vector(cov: Tensor) -> Tensor:
+    """Flatten the lower triangle of a symmetric matrix, row by row.
+
+    Args:
+        cov: shape ``(*batch, dim, dim)``.
+
+    Returns:
+        Shape ``(*batch, dim * (dim + 1) / 2)``.
+
+    Example:
+        >>> import torch
+        >>> tril_to_vector(torch.tensor([[1.0, 2.0], [2.0, 3.0]])).tolist()
+        [1.0, 2.0, 3.0]
+    """
+    row, column = torch.tril_indices(cov.shape[-1], cov.shape[-1], device=cov.device)
+    return cov[..., row, column]

@@ -1,0 +1,396 @@
+"""The sequential core of the fast filter: mean recurrences with hand-written reverse loops.
+
+With a constant transition covariance everything but the mean depends on the masks and on the
+episode starts alone, so it is computed for a whole ``[time, batch]`` minibatch ahead of the loop
+(design: one small network and two matrix-vector products a step remain). The reverse loop is
+written by hand for two reasons: weight gradients become single matrix products after the loop,
+and no gradient of a batched Cholesky factorisation is ever taken.
+
+All tensors here are time-major, ``[time, batch, ...]``. The public door is
+:func:`torchrl_drbpn.functional.filtering.filter_sequence`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+__all__ = ["ACTIVATIONS", "InformationRecurrence", "InnovationRecurrence", "MeanNetwork"]
+
+ACTIVATIONS = ("relu", "tanh")
+
+
+class MeanNetwork(NamedTuple):
+    r"""Describe the transition mean f(mean, action) as plain tensors.
+
+    .. math:: f(m, a) = [m +] \; W_k \, \sigma(\dots \sigma(W_1 (m, a) + b_1)) + b_k
+
+    Eq. (8) [DRBPN]. Knowing the weights is what lets the fast filter write its own reverse loop.
+
+    Args:
+        weights: of each layer, shape ``(out, in)``; the first layer's ``in`` is state + action,
+            in this order.
+        biases: of each layer, shape ``(out,)``.
+        residual: whether the mean is added to the output.
+        activation: "relu" or "tanh", between the layers.
+
+    Example:
+        >>> import torch
+        >>> weights, biases = (torch.zeros(3, 5),), (torch.zeros(3),)
+        >>> f = MeanNetwork(weights, biases, residual=True, activation="relu")
+        >>> f(torch.ones(4, 3), torch.zeros(4, 2)).tolist() == torch.ones(4, 3).tolist()
+        True
+    """
+
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+    residual: bool
+    activation: str
+
+    def __call__(self, mean: Tensor, action: Tensor) -> Tensor:
+        """Evaluate f.
+
+        Args:
+            mean: shape ``(*batch, state)``.
+            action: shape ``(*batch, action)``.
+
+        Returns:
+            Shape ``(*batch, state)``.
+        """
+        hidden = torch.cat([mean, action], -1)
+        last = len(self.weights) - 1
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            hidden = torch.nn.functional.linear(hidden, weight, bias)
+            if i < last:
+                hidden = hidden.relu() if self.activation == "relu" else hidden.tanh()
+        return mean + hidden if self.residual else hidden
+
+
+class _Steps:
+    """The network of one step, forward and back, over [batch, ...] tensors.
+
+    The first layer's action part is computed for the whole sequence outside (``drive``), so a
+    step sees only the mean's part ``first``.
+    """
+
+    def __init__(
+        self, residual: bool, activation: str, first: Tensor, rest: tuple[Tensor, ...]
+    ) -> None:
+        self.residual = residual
+        self.relu = activation == "relu"
+        self.first = first
+        self.weights = rest[0::2]
+        self.biases = rest[1::2]
+        self.first_t = first.t()
+        self.weights_t = [w.t() for w in self.weights]
+
+    def forward(self, previous: Tensor, drive: Tensor) -> tuple[Tensor, list[Tensor]]:
+        x = torch.addmm(drive, previous, self.first_t)
+        hidden: list[Tensor] = []
+        for weight_t, bias in zip(self.weights_t, self.biases, strict=True):
+            x = x.relu_() if self.relu else x.tanh_()
+            hidden.append(x)
+            x = torch.addmm(bias, x, weight_t)
+        return (x.add_(previous) if self.residual else x), hidden
+
+    def backward(self, grad: Tensor, hidden: tuple[Tensor, ...]) -> tuple[Tensor, list[Tensor]]:
+        """Return the gradient by ``previous`` and by every pre-activation, first layer first."""
+        x = grad
+        grads: list[Tensor] = []
+        for weight, h in zip(reversed(self.weights), reversed(hidden), strict=True):
+            grads.append(x)
+            x = x @ weight
+            # relu'(.) and tanh'(.) from the stored output.
+            x = torch.where(h > 0, x, 0.0) if self.relu else x * (1 - h * h)
+        grads.append(x)
+        back = torch.addmm(grad, x, self.first) if self.residual else x @ self.first
+        return back, grads[::-1]
+
+    def weight_grads(
+        self, previous: Tensor, hidden: list[Tensor], grads: list[Tensor]
+    ) -> list[Tensor]:
+        """Turn stacked [time * batch, ...] gradients into those of first, W2, b2, W3, b3, ..."""
+        out = [grads[0].t() @ previous]
+        for h, g in zip(hidden, grads[1:], strict=True):
+            out += [g.t() @ h, g.sum(0)]
+        return out
+
+
+def _run(
+    steps: _Steps,
+    drive: Tensor,
+    start: Tensor,
+    reset: Tensor,
+    initial_mean: Tensor,
+    restart: Tensor | None,
+    restart_mean: Tensor | None,
+    gain: Tensor,
+    target: Tensor,
+    emission: Tensor | None,
+) -> tuple[list[Tensor], list[Tensor], list[Tensor], list[list[Tensor]]]:
+    """Run the mean recurrence; returns predicted and filtered means, inputs of f, hidden layers.
+
+    With ``emission`` H: mean = m + (y - m H') gain, gain [time, batch, obs, state].
+    Without:             mean = m + target - gain m, gain [time, batch, state, state].
+    """
+    predicted_all: list[Tensor] = []
+    filtered_all: list[Tensor] = []
+    inputs: list[Tensor] = []
+    hidden_all: list[list[Tensor]] = []
+    emission_t = None if emission is None else emission.t()
+    restarts = (None,) * len(drive) if restart is None else restart.unbind(0)
+    stored = restarts if restart_mean is None else restart_mean.unbind(0)
+    mean = start
+    for drive_t, reset_t, gain_t, target_t, restart_t, stored_t in zip(
+        drive.unbind(0),
+        reset.unbind(0),
+        gain.unbind(0),
+        target.unbind(0),
+        restarts,
+        stored,
+        strict=True,
+    ):
+        if restart_t is not None and stored_t is not None:
+            mean = torch.where(restart_t, stored_t, mean)
+        inputs.append(mean)
+        mean, hidden = steps.forward(mean, drive_t)
+        hidden_all.append(hidden)
+        mean = torch.where(reset_t, initial_mean, mean)
+        predicted_all.append(mean)
+        if emission_t is not None:
+            error = torch.addmm(target_t, mean, emission_t, alpha=-1).unsqueeze(1)
+            mean = torch.baddbmm(mean.unsqueeze(1), error, gain_t).squeeze(1)
+        else:
+            pulled = torch.baddbmm(target_t.unsqueeze(2), gain_t, mean.unsqueeze(2), alpha=-1)
+            mean = mean + pulled.squeeze(2)
+        filtered_all.append(mean)
+    return predicted_all, filtered_all, inputs, hidden_all
+
+
+class _Reverse(NamedTuple):
+    """What the reverse loop hands to the batched part after it, all [time * batch, ...]."""
+
+    filtered: Tensor  # total gradient by the filtered mean
+    error: Tensor  # by the innovation (innovation form), else an alias of filtered
+    predicted: Tensor  # by the predicted mean
+    inputs: Tensor  # by the input of f
+    layers: list[Tensor]  # by each pre-activation
+    start: Tensor  # [batch, state], by the belief the sequence starts from
+
+
+def _run_back(
+    steps: _Steps,
+    reset: Tensor,
+    restart: Tensor | None,
+    gain: Tensor,
+    hidden: tuple[Tensor, ...],
+    grad_filtered: Tensor,
+    grad_predicted: Tensor | None,
+    error_term: Tensor | None,
+    emission: Tensor | None,
+) -> _Reverse:
+    """Run the recurrence of :func:`_run` backwards.
+
+    ``error_term`` (innovation form) is the gradient of the likelihood by the innovation,
+    ``grad_predicted`` what reaches the predicted mean from outside, None for nothing.
+    """
+    carry = torch.zeros_like(grad_filtered[0])
+    g_filtered: list[Tensor] = []
+    g_error: list[Tensor] = []
+    g_predicted: list[Tensor] = []
+    g_inputs: list[Tensor] = []
+    g_layers: list[list[Tensor]] = []
+    resets, gains = reset.unbind(0), gain.unbind(0)
+    restarts = None if restart is None else restart.unbind(0)
+    outer = grad_filtered.unbind(0)
+    predicted_outer = None if grad_predicted is None else grad_predicted.unbind(0)
+    errors = None if error_term is None else error_term.unbind(0)
+    layers = [h.unbind(0) for h in hidden]
+    for t in range(len(outer) - 1, -1, -1):
+        g = outer[t] + carry
+        g_filtered.append(g)
+        if emission is not None and errors is not None:
+            # innovation v = y - H m enters the mean through the gain and the likelihood directly
+            ge = torch.baddbmm(errors[t].unsqueeze(2), gains[t], g.unsqueeze(2)).squeeze(2)
+            g_error.append(ge)
+            g = torch.addmm(g if predicted_outer is None else g + predicted_outer[t], ge, emission, alpha=-1)
+        else:
+            base = g if predicted_outer is None else g + predicted_outer[t]
+            g = torch.baddbmm(base.unsqueeze(1), g.unsqueeze(1), gains[t], alpha=-1).squeeze(1)
+        g_predicted.append(g)
+        g = torch.where(resets[t], 0.0, g)
+        g, by_layer = steps.backward(g, tuple(h[t] for h in layers))
+        g_layers.append(by_layer)
+        g_inputs.append(g)
+        carry = g if restarts is None else torch.where(restarts[t], 0.0, g)
+
+    def stack(rows: list[Tensor]) -> Tensor:
+        return torch.stack(rows[::-1]).flatten(0, 1)
+
+    filtered = stack(g_filtered)
+    return _Reverse(
+        filtered,
+        stack(g_error) if g_error else filtered,
+        stack(g_predicted),
+        stack(g_inputs),
+        [stack([g[i] for g in g_layers]) for i in range(len(g_layers[0]))],
+        carry,
+    )
+
+
+def _spd_factor(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the inverse, the log-determinant and the factor of a batch of SPD matrices.
+
+    One item that fails (it cannot while the noise floors hold) turns into NaN by itself instead
+    of failing the whole batch, without a synchronisation or a branch.
+    """
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    failed = (info != 0)[..., None, None]
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    factor = torch.where(failed, eye, factor)
+    inverse = torch.cholesky_inverse(factor).mT  # symmetric; LAPACK's result is column-major
+    inverse = torch.where(failed, torch.nan, inverse)
+    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return inverse, log_det, factor
+
+
+class InnovationRecurrence(torch.autograd.Function):
+    """mean_t = m_t + G_t A_t^-1 (y_t - H m_t) and its log-likelihood, obs x obs factorised."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor]:
+        (residual, activation, y, observed, reset, restart, restart_mean, start, drive) = args[:9]
+        initial_mean, H, cov, initial_cov, cross, initial_cross, first, *rest = args[9:]
+        steps = _Steps(residual, activation, first, tuple(rest))
+        time, batch, obs = y.shape
+        state = start.shape[-1]
+
+        both = observed.unsqueeze(-1) & observed.unsqueeze(-2)
+        eye = torch.eye(obs, dtype=y.dtype, device=y.device)
+        chosen = torch.where(reset.unsqueeze(-1), initial_cov, cov)
+        inverse, log_det, _ = _spd_factor(torch.where(both, chosen, eye))
+        inverse = torch.where(both, inverse, 0.0)
+        flat = inverse.reshape(time * batch * obs, obs)
+        shape = (time, batch, obs, state)
+        gain = torch.where(
+            reset.unsqueeze(-1), (flat @ initial_cross.t()).view(shape), (flat @ cross.t()).view(shape)
+        )
+
+        predicted, filtered, inputs, hidden = _run(
+            steps, drive, start, reset, initial_mean, restart, restart_mean, gain, y, H
+        )
+        m, mean = torch.stack(predicted), torch.stack(filtered)
+        r = torch.where(observed, torch.addmm(y.flatten(0, 1), m.flatten(0, 1), H.t(), alpha=-1).view_as(y), 0.0)
+        z = (inverse @ r.unsqueeze(-1)).squeeze(-1)
+        ll = -0.5 * ((z * r).sum(-1) + log_det)
+
+        layers = [torch.stack([h[i] for h in hidden]) for i in range(len(hidden[0]))]
+        ctx.save_for_backward(
+            reset, restart, inverse, gain, z, m, torch.stack(inputs), H, cross, initial_cross,
+            first, *rest, *layers,
+        )  # fmt: skip
+        ctx.network = (residual, activation, len(rest))
+        ctx.set_materialize_grads(False)
+        return m, mean, ll
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, g_m: Tensor | None, g_mean: Tensor | None, g_ll: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        (reset, restart, inverse, gain, z, m, inputs, H, cross, initial_cross, first) = (
+            ctx.saved_tensors[:11]
+        )
+        residual, activation, count = ctx.network
+        rest, layers = ctx.saved_tensors[11 : 11 + count], ctx.saved_tensors[11 + count :]
+        steps = _Steps(residual, activation, first, rest)
+        obs, state = z.shape[-1], m.shape[-1]
+
+        g_mean = torch.zeros_like(m) if g_mean is None else g_mean
+        g_ll = torch.zeros_like(m[..., 0]) if g_ll is None else g_ll
+        by_ll = -g_ll.unsqueeze(-1) * z  # d ll / d r = -z
+        back = _run_back(steps, reset, restart, gain, layers, g_mean, g_m, by_ll, H)
+
+        g_e = back.error  # by the innovation: u - g_ll z, with u = M A^-1 G' g
+        zf, mf = z.flatten(0, 1), m.flatten(0, 1)
+        half = 0.5 * g_ll.reshape(-1, 1)
+        # dA = g_ll/2 (z z' - A^-1) - u z'  =  -(u - g_ll z) z' - g_ll/2 (z z' + A^-1)
+        left = -(g_e + half * zf)
+        was_reset = reset.reshape(-1, 1)
+
+        def split(rows: Tensor) -> tuple[Tensor, Tensor]:
+            """Keep the rows of ordinary steps, and those of episode starts."""
+            return torch.where(was_reset, 0.0, rows), torch.where(was_reset, rows, 0.0)
+
+        flat_inverse = inverse.reshape(-1, obs * obs)
+        g_cov, g_cross = [], []
+        for left_i, half_i, g_i in zip(split(left), split(half), split(back.filtered), strict=True):
+            by_cov = left_i.t() @ zf - (half_i.t() @ flat_inverse).view(obs, obs)
+            g_cov.append(0.5 * (by_cov + by_cov.t()))
+            g_cross.append(g_i.t() @ zf)
+
+        g_initial_mean = torch.where(was_reset, back.predicted, 0.0).sum(0)
+        g_restart = None
+        if restart is not None:
+            g_restart = torch.where(restart, back.inputs.view_as(m), 0.0)
+        weights = steps.weight_grads(inputs.flatten(0, 1), [h.flatten(0, 1) for h in layers], back.layers)
+        return (
+            None, None, g_e.view_as(z), None, None, None, g_restart, back.start,
+            back.layers[0].view(*m.shape[:2], -1), g_initial_mean, -(g_e.t() @ mf),
+            g_cov[0], g_cov[1], g_cross[0], g_cross[1], *weights,
+        )  # fmt: skip
+
+
+class InformationRecurrence(torch.autograd.Function):
+    """mean_t = m_t + C_t (b_t - N_t m_t) with C_t = precision_t^-1, state x state factorised."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor]:
+        (residual, activation, precision, gathered, evidence) = args[:5]
+        reset, restart, restart_mean, start, drive, initial_mean, first, *rest = args[5:]
+        steps = _Steps(residual, activation, first, tuple(rest))
+        C, log_det, _ = _spd_factor(precision)
+        D = C @ gathered
+        c = (C @ evidence.unsqueeze(-1)).squeeze(-1)
+        predicted, filtered, inputs, hidden = _run(
+            steps, drive, start, reset, initial_mean, restart, restart_mean, D, c, None
+        )
+        m, mean = torch.stack(predicted), torch.stack(filtered)
+        layers = [torch.stack([h[i] for h in hidden]) for i in range(len(hidden[0]))]
+        ctx.save_for_backward(
+            reset, restart, C, D, m, mean, torch.stack(inputs), first, *rest, *layers
+        )
+        ctx.network = (residual, activation, len(rest))
+        ctx.set_materialize_grads(False)
+        return m, mean, log_det
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, g_m: Tensor | None, g_mean: Tensor | None, g_log_det: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        reset, restart, C, D, m, mean, inputs, first = ctx.saved_tensors[:8]
+        residual, activation, count = ctx.network
+        rest, layers = ctx.saved_tensors[8 : 8 + count], ctx.saved_tensors[8 + count :]
+        steps = _Steps(residual, activation, first, rest)
+        g_mean = torch.zeros_like(m) if g_mean is None else g_mean
+        back = _run_back(steps, reset, restart, D, layers, g_mean, g_m, None, None)
+
+        p = C @ back.filtered.view_as(m).unsqueeze(-1)  # by b_t - N_t m_t
+        g_gathered = -p @ m.unsqueeze(-2)
+        g_precision = -p @ (mean - m).unsqueeze(-2)
+        if g_log_det is not None:
+            g_precision = torch.addcmul(g_precision, g_log_det[..., None, None], C)
+        was_reset = reset.reshape(-1, 1)
+        g_initial_mean = torch.where(was_reset, back.predicted, 0.0).sum(0)
+        g_restart = None
+        if restart is not None:
+            g_restart = torch.where(restart, back.inputs.view_as(m), 0.0)
+        weights = steps.weight_grads(inputs.flatten(0, 1), [h.flatten(0, 1) for h in layers], back.layers)
+        return (
+            None, None, g_precision, g_gathered, p.squeeze(-1), None, None, g_restart, back.start,
+            back.layers[0].view(*m.shape[:2], -1), g_initial_mean, *weights,
+        )  # fmt: skip
