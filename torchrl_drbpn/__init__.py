@@ -1,1 +1,49 @@
 """A batched, differentiable belief filter with per-component missing data, wired into TorchRL."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from torchrl_drbpn import functional
+from torchrl_drbpn.envs import GymnasiumBatchEnv
+from torchrl_drbpn.modules import (
+    BeliefFilter,
+    BeliefFilterModule,
+    GaussianTransition,
+    LinearGaussianEmission,
+)
+from torchrl_drbpn.objectives import BeliefModelLoss, DRBPNLoss
+from torchrl_drbpn.transforms import (
+    FillLastObserved,
+    MaskedObservationNorm,
+    ObservationMissingness,
+    ObservationNoise,
+    ObservedFromNaN,
+    PreviousAction,
+    RunningReturnScale,
+    SensorReduction,
+    seed_env,
+)
+
+try:
+    __version__ = version("torchrl-drbpn")
+except PackageNotFoundError:  # a checkout that was never installed
+    __version__ = "0+unknown"
+
+__all__ = [
+    "BeliefFilter",
+    "BeliefFilterModule",
+    "BeliefModelLoss",
+    "DRBPNLoss",
+    "FillLastObserved",
+    "GaussianTransition",
+    "GymnasiumBatchEnv",
+    "LinearGaussianEmission",
+    "MaskedObservationNorm",
+    "ObservationMissingness",
+    "ObservationNoise",
+    "ObservedFromNaN",
+    "PreviousAction",
+    "RunningReturnScale",
+    "SensorReduction",
+    "functional",
+    "seed_env",
+]

@@ -1,0 +1,46 @@
+"""Pure tensor maths of the belief filter and of the corruption; torch alone."""
+
+from torchrl_drbpn.functional.filtering import (
+    FilterOutput,
+    StateSpace,
+    choose_form,
+    filter_sequence,
+    filter_step,
+    filtered_cov,
+    predict_step,
+)
+from torchrl_drbpn.functional.gaussian import (
+    Belief,
+    full_cov,
+    inverse_softplus,
+    masked_cov,
+    masked_log_density,
+    positive_std,
+    tril_to_vector,
+    zero_missing,
+)
+from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
+from torchrl_drbpn.functional.recurrence import MeanNetwork
+
+__all__ = [
+    "Belief",
+    "FilterOutput",
+    "MeanNetwork",
+    "StateSpace",
+    "choose_form",
+    "filter_sequence",
+    "filter_step",
+    "filtered_cov",
+    "full_cov",
+    "innovation",
+    "inverse_softplus",
+    "log_likelihood",
+    "masked_cov",
+    "masked_log_density",
+    "positive_std",
+    "predict",
+    "predict_step",
+    "tril_to_vector",
+    "update",
+    "zero_missing",
+]

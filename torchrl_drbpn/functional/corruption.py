@@ -1,8 +1,8 @@
 """Sample missing entries and noise of an observation, from a generator that the caller owns.
 
 Eq. (2) [DRBPN]: noise falls on the state of the simulator, then entries of the noisy complete
-observation go missing, completely at random (MCAR), at random given what always arrives (MAR), or not
-at random (NMAR). The terms are those of Rubin, "Inference and missing data", Biometrika 1976.
+observation go missing, completely at random (MCAR), at random given what always arrives (MAR), or
+not at random (NMAR). The terms are those of Rubin, "Inference and missing data", Biometrika 1976.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class MissingnessMechanism(NamedTuple):
         always_observed: bool, shape `(obs,)`; True where an entry never goes missing.
         bias: b0, shape `(obs,)`; minus infinity where `always_observed`, so that the probability
             there is exactly 0.
-        observation_weight: b2, shape `(obs, obs)`, row i for entry i, per observation unit; under MAR
-            the columns outside `always_observed` are 0.
+        observation_weight: b2, shape `(obs, obs)`, row i for entry i, per observation unit; under
+            MAR the columns outside `always_observed` are 0.
         action_weight: b1, shape `(obs, action)`, per action unit.
     """
 
@@ -110,15 +110,15 @@ def missing_probability(
 ) -> Tensor:
     r"""Return the probability that each entry goes missing.
 
-    $P(\text{missing}_i) = \min(\sigma(b_{1i}^\top a_{t-1} + b_{2i}^\top x + b_{0i}), \eta)$, and 0 for
-    the always observed entries (experiments of [DRBPN]); under MAR x stands for the always observed
-    entries alone. It realises clearly less than eta.
+    $P(\text{missing}_i) = \min(\sigma(b_{1i}^\top a_{t-1} + b_{2i}^\top x + b_{0i}), \eta)$, and 0
+    for the always observed entries (experiments of [DRBPN]); under MAR x stands for the always
+    observed entries alone. It realises clearly less than eta.
 
     Args:
         mechanism: parameters, on the device and in the dtype of `observation`.
         observation: complete observation as it arrives (noise included), shape `(*batch, obs)`.
-        previous_action: a_{t-1}, shape `(*batch, action)`; None counts as zero, as at the first step
-            of an episode.
+        previous_action: a_{t-1}, shape `(*batch, action)`; None counts as zero, as at the first
+            step of an episode.
         eta: upper bound of the probability.
 
     Returns:
@@ -181,19 +181,3 @@ def sample_noise(std: Tensor | float, like: Tensor, generator: torch.Generator) 
     """
     noise = torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
     return noise.mul_(std)
-
-
-def mask_observation(observation: Tensor, observed: Tensor) -> Tensor:
-    """Return `observation` with 0 where `observed` is False, whatever lies beneath, NaN included.
-
-    Args:
-        observation: shape `(*batch, obs)`.
-        observed: bool, shape `(*batch, obs)`.
-
-    Returns:
-        Shape and dtype of `observation`.
-
-    >>> mask_observation(torch.tensor([1.0, float("nan")]), torch.tensor([True, False])).tolist()
-    [1.0, 0.0]
-    """
-    return torch.where(observed, observation, 0.0)

@@ -19,7 +19,7 @@ class Moments(NamedTuple):
     """Hold how many values were seen, their mean, and their squared deviations.
 
     Attributes:
-        count: number of observed values of every component, shape `(*event)`, float64.
+        n: number of observed values of every component, shape `(*event)`, float64.
         mean: their mean, 0 where nothing was observed, shape `(*event)`, units of the values.
         m2: sum of squared deviations from that mean, shape `(*event)`, squared units.
 
@@ -31,7 +31,7 @@ class Moments(NamedTuple):
         True
     """
 
-    count: Tensor
+    n: Tensor
     mean: Tensor
     m2: Tensor
 
@@ -48,7 +48,7 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> Moments:
             where it is None.
 
     Returns:
-        The moments, in float64; count, mean and m2 are 0 where nothing was observed.
+        The moments, in float64; n, mean and m2 are 0 where nothing was observed.
 
     Raises:
         TypeError: `observed` is not bool.
@@ -62,9 +62,8 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> Moments:
     """
     value = value.double()
     if observed is None:
-        count = torch.full_like(value[0], value.shape[0])
-        mean = value.mean(0)
-        return Moments(count, mean, (value - mean).square_().sum(0))
+        var, mean = torch.var_mean(value, 0, correction=0)
+        return Moments(torch.full_like(mean, value.shape[0]), mean, var.mul_(value.shape[0]))
     if observed.dtype is not torch.bool:
         raise TypeError(
             f"`observed` must be bool, got {observed.dtype}. "
@@ -76,11 +75,12 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> Moments:
             f"component, got {tuple(observed.shape)}."
         )
     weight = observed.double()
-    count = weight.sum(0)
-    mean = torch.where(observed, value, 0.0).sum(0).div_(count.clamp_min(1.0))
-    # where, not times: 0 * NaN is NaN.
-    deviation = torch.where(observed, value - mean, 0.0)
-    return Moments(count, mean, deviation.square_().sum(0))
+    n = weight.sum(0)
+    # Filled before any arithmetic, since 0 * NaN is NaN; finite from here on, so weights will do.
+    value = value.masked_fill(~observed, 0.0)
+    mean = value.sum(0).div_(n.clamp_min(1.0))
+    deviation = (value - mean).mul_(weight)
+    return Moments(n, mean, torch.linalg.vecdot(deviation, deviation, dim=0))
 
 
 def merge_moments(first: Moments, second: Moments) -> Moments:
@@ -105,14 +105,14 @@ def merge_moments(first: Moments, second: Moments) -> Moments:
         >>> torch.allclose(split.m2, masked_moments(x).m2)
         True
     """
-    count = first.count + second.count
-    # One product serves both formulas. The clamp only meets count 0, where the weight is 0 anyway.
+    n = first.n + second.n
+    # One product serves both formulas. The clamp only meets n = 0, where the weight is 0 anyway.
     delta = second.mean - first.mean
-    shift = delta * (second.count / count.clamp_min(1.0))
+    shift = delta * (second.n / n.clamp_min(1.0))
     return Moments(
-        count,
+        n,
         first.mean + shift,
-        (first.m2 + second.m2).addcmul_(delta * first.count, shift),
+        (first.m2 + second.m2).addcmul_(delta * first.n, shift),
     )
 
 
@@ -134,4 +134,4 @@ def variance(moments: Moments) -> Tensor:
         >>> torch.allclose(variance(masked_moments(x)), x.var(0, correction=0))
         True
     """
-    return torch.where(moments.count > 1, moments.m2 / moments.count, 1.0)
+    return (moments.m2 / moments.n).masked_fill_(moments.n < 2.0, 1.0)

@@ -1,0 +1,294 @@
+"""The belief filter with TensorDict keys and the manners of TorchRL's GRUModule."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
+from torchrl.modules.tensordict_module.rnn import recurrent_mode
+
+from torchrl_drbpn.functional import tril_to_vector
+from torchrl_drbpn.modules.belief_filter import BeliefFilter
+
+__all__ = ["BeliefFilterModule"]
+
+IN_KEYS: tuple[NestedKey, ...] = (
+    "observation",
+    "observed",
+    "previous_action",
+    "is_init",
+    ("recurrent", "mean"),
+    ("recurrent", "age"),
+)
+DEFAULT_OUT_KEYS: tuple[NestedKey, ...] = (
+    "features",
+    ("belief", "mean"),
+    ("belief", "log_likelihood"),
+)
+OPTIONAL_OUT_KEYS: tuple[NestedKey, ...] = (
+    ("belief", "cov"),
+    ("belief", "observation"),
+    ("belief", "predicted_observation"),
+    ("belief", "innovation_cov"),
+)
+
+
+class BeliefFilterModule(TensorDictModuleBase):
+    r"""Read what arrived, write the belief: a :class:`BeliefFilter` with keys.
+
+    It stands where a ``GRUModule`` stands in a TorchRL pipeline: one step at a time by default,
+    whole trajectories (last batch dimension = time) under ``set_recurrent_mode(True)``, its
+    primer found by ``get_primers_from_module``.
+
+    The recurrent state is ``("recurrent", "mean")``, the filtered mean of the step before, and
+    ``("recurrent", "age")``, the updates since the reset. The learned initial belief is used
+    where ``is_init & (age == 0)``; where ``is_init`` comes with an older age (the "next" stream
+    of ``GAE(shifted=False)``, slices of a replay buffer) the stored state is taken. Without
+    recurrent entries every row starts from the initial belief; one step at a time so does every
+    step, with one warning.
+
+    Args:
+        filter: the filter.
+
+    Keyword Args:
+        in_keys: the six entries read, in the order ``observation, observed, previous_action,
+            is_init, ("recurrent", "mean"), ("recurrent", "age")``: a list of the first four or
+            of all six, or a dict from these names to yours.
+        out_keys: the entries written, a list chosen from ``features``, ``("belief", "mean")``,
+            ``("belief", "log_likelihood")`` (the default) and, computed only where asked for,
+            ``("belief", "cov")``, ``("belief", "observation")`` (H m + B a + d of the filtered
+            mean: every sensor's estimate), ``("belief", "predicted_observation")``,
+            ``("belief", "innovation_cov")``; or a dict from these names to yours. The recurrent
+            state is always written, under ``("next", ...)``.
+        policy_input: what ``features`` holds, for policy and value to read (eq. 11 [DRBPN]):
+            "mean", or "mean_cov" (lower triangle of the filtered covariance behind the mean).
+        default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
+
+    Raises:
+        ValueError: for a key list of another length, an unknown name, or an unknown choice.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import set_recurrent_mode
+        >>> module = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
+        >>> data = TensorDict(
+        ...     observation=torch.randn(3, 10, 5),
+        ...     observed=torch.rand(3, 10, 5) < 0.7,
+        ...     previous_action=torch.zeros(3, 10, 2),
+        ...     is_init=torch.zeros(3, 10, 1, dtype=torch.bool),
+        ...     batch_size=[3, 10])
+        >>> with set_recurrent_mode(True):
+        ...     out = module(data)
+        >>> out["features"].shape, out["belief", "log_likelihood"].shape
+        (torch.Size([3, 10, 5]), torch.Size([3, 10]))
+    """
+
+    def __init__(
+        self,
+        filter: BeliefFilter,  # noqa: A002 - the contract's name
+        *,
+        in_keys: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None = None,
+        policy_input: Literal["mean", "mean_cov"] = "mean",
+        default_recurrent_mode: bool | None = None,
+    ) -> None:
+        super().__init__()
+        if policy_input not in ("mean", "mean_cov"):
+            raise ValueError(f"`policy_input` must be 'mean' or 'mean_cov', got {policy_input!r}.")
+        self.filter = filter
+        self.policy_input = policy_input
+        self._default_recurrent_mode = default_recurrent_mode
+        self._warned = False
+        self.in_keys = _read_in_keys(in_keys)
+        self._out = _read_out_keys(out_keys)
+        self._next_mean = unravel_key(("next", self.in_keys[4]))
+        self._next_age = unravel_key(("next", self.in_keys[5]))
+        self.out_keys = [*self._out.values(), self._next_mean, self._next_age]
+
+    # ------------------------------------------------------------------ forward
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the belief; see the class for keys and modes."""
+        observation, observed, action, is_init = (self._get(tensordict, i) for i in range(4))
+        mean = tensordict.get(self.in_keys[4], None)
+        age = tensordict.get(self.in_keys[5], None)
+        first = is_init.squeeze(-1)
+        sequence = self.recurrent_mode
+        if sequence and first.ndim == 0:
+            raise ValueError(
+                "under set_recurrent_mode(True) the last batch dimension is time, but the input "
+                "has no batch dimension at all."
+            )
+        fresh = mean is None or age is None
+        if fresh:
+            mean, age, first = self._fresh_state(observation, first, sequence)
+        reset = first & (age.squeeze(-1) == 0)
+
+        want_cov = ("belief", "cov") in self._out or self.policy_input == "mean_cov"
+        if sequence:
+            # At an is_init with an older age the row is stitched: take the stored state there.
+            restart = first & ~reset
+            out = self.filter(
+                mean[..., 0, :], None, action, observation, observed, reset,
+                restart=restart, restart_mean=mean, return_cov=want_cov,
+            )  # fmt: skip
+            if fresh:
+                age = _steps_since(reset)
+        else:
+            out = self.filter.step(
+                mean, None, action, observation, observed, reset, return_cov=want_cov
+            )
+
+        tensordict.set(self._next_mean, out.mean)
+        tensordict.set(self._next_age, age + 1)
+        features = out.mean
+        if self.policy_input == "mean_cov" and out.cov is not None:
+            features = torch.cat([out.mean, tril_to_vector(out.cov)], -1)
+        results: dict[NestedKey, Tensor | None] = {
+            "features": features,
+            ("belief", "mean"): out.mean,
+            ("belief", "log_likelihood"): out.log_likelihood,
+            ("belief", "cov"): out.cov,
+        }
+        if any(name not in results for name in self._out):
+            previous = mean
+            if sequence:
+                shifted = torch.cat([mean[..., :1, :], out.mean[..., :-1, :]], -2)
+                previous = torch.where(restart.unsqueeze(-1), mean, shifted)
+            results.update(self._observations(previous, action, reset, out.mean))
+        for name, key in self._out.items():
+            tensordict.set(key, results[name])
+        return tensordict
+
+    def _get(self, tensordict: TensorDictBase, index: int) -> Tensor:
+        value = tensordict.get(self.in_keys[index], None)
+        if value is not None:
+            return value
+        sources = {
+            1: "ObservationMissingness or ObservedFromNaN writes it (all True if nothing is missing)",
+            2: "the PreviousAction transform writes it",
+            3: "TorchRL's InitTracker transform writes it",
+        }
+        hint = sources.get(index, "does the environment use another name? Pass in_keys")
+        raise KeyError(f"`{self.in_keys[index]}` is not in the tensordict: {hint}.")
+
+    def _fresh_state(
+        self, observation: Tensor, first: Tensor, sequence: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Make the state of rows that bring none: they start from the initial belief."""
+        mean = observation.new_zeros(*first.shape, self.filter.state_dim)
+        age = torch.zeros(*first.shape, 1, dtype=torch.int64, device=first.device)
+        if sequence:
+            return mean, age, torch.cat([torch.ones_like(first[..., :1]), first[..., 1:]], -1)
+        if not self._warned and not torch.compiler.is_compiling():
+            self._warned = True
+            warnings.warn(
+                f"`{self.in_keys[4]}` is not in the tensordict, so every step starts from the "
+                "initial belief and nothing is remembered. Append make_tensordict_primer() to the "
+                "environment, or collect with auto_register_policy_transforms=True.",
+                stacklevel=2,
+            )
+        return mean, age, torch.ones_like(first)
+
+    def _observations(
+        self, previous: Tensor, action: Tensor, reset: Tensor, mean: Tensor
+    ) -> dict[NestedKey, Tensor | None]:
+        """Compute what only reports read: estimates of the sensors, and S."""
+        emission = self.filter.emission
+        predicted = self.filter.predict(previous, action, reset)
+        cov = None
+        if ("belief", "innovation_cov") in self._out:
+            H = emission.matrix
+            cov = H @ predicted.cov @ H.mT + emission.cov()
+        return {
+            ("belief", "observation"): emission(mean, action),
+            ("belief", "predicted_observation"): emission(predicted.mean, action),
+            ("belief", "innovation_cov"): cov,
+        }
+
+    # ------------------------------------------------------------------ modes and primer
+    @property
+    def recurrent_mode(self) -> bool:
+        """Whether the last batch dimension is read as time."""
+        mode = recurrent_mode()
+        return bool(self._default_recurrent_mode) if mode is None else mode
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Make the transform that puts the recurrent state into the environment.
+
+        Returns:
+            A primer of zeros for mean ``(state,)`` and age ``(1,)``; the zero age is what makes
+            the filter start from its learned initial belief.
+
+        Example:
+            >>> module = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
+            >>> primer = module.make_tensordict_primer()
+            >>> ("recurrent", "mean") in primer.primers.keys(True)
+            True
+        """
+        parameter = self.filter.initial_mean
+        return TensorDictPrimer(
+            {
+                self.in_keys[4]: Unbounded(
+                    (self.filter.state_dim,), dtype=parameter.dtype, device=parameter.device
+                ),
+                self.in_keys[5]: Unbounded((1,), dtype=torch.int64, device=parameter.device),
+            },
+            expand_specs=True,
+        )
+
+
+def _steps_since(reset: Tensor) -> Tensor:
+    """Count the steps since the last reset in each row, shape (*batch, time, 1)."""
+    index = torch.arange(reset.shape[-1], device=reset.device).expand(reset.shape)
+    last = torch.where(reset, index, 0).cummax(-1).values
+    return (index - last).unsqueeze(-1)
+
+
+def _read_in_keys(
+    given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
+) -> list[NestedKey]:
+    if given is None:
+        return list(IN_KEYS)
+    if isinstance(given, Mapping):
+        unknown = [key for key in given if key not in IN_KEYS]
+        if unknown:
+            raise ValueError(f"`in_keys` names {unknown}; the filter reads {list(IN_KEYS)}.")
+        return [unravel_key(given.get(key, key)) for key in IN_KEYS]
+    keys = [unravel_key(key) for key in given]
+    if len(keys) not in (4, 6):
+        raise ValueError(
+            f"`in_keys` must have 4 or 6 entries, in the order {list(IN_KEYS)}, got {keys}. To "
+            "rename one of them pass a dict such as {'observation': 'pixels_encoded'}."
+        )
+    return keys if len(keys) == 6 else [*keys, *IN_KEYS[4:]]
+
+
+def _read_out_keys(
+    given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
+) -> dict[NestedKey, NestedKey]:
+    """Map the canonical names to the user's keys; recurrent entries in a list are implied."""
+    names = (*DEFAULT_OUT_KEYS, *OPTIONAL_OUT_KEYS)
+    if given is None:
+        return {name: name for name in DEFAULT_OUT_KEYS}
+    if isinstance(given, Mapping):
+        pairs = {unravel_key(name): unravel_key(key) for name, key in given.items()}
+    else:
+        keys = [unravel_key(key) for key in given]
+        pairs = {key: key for key in keys if not (isinstance(key, tuple) and key[0] == "next")}
+    unknown = [name for name in pairs if name not in names]
+    if unknown:
+        raise ValueError(
+            f"`out_keys` names {unknown}; the filter can write {list(names)}. To write one under "
+            "another key pass a dict such as {'features': 'embed'}."
+        )
+    return pairs

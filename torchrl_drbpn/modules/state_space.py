@@ -1,0 +1,320 @@
+"""The learned state-space model: how the state moves, and what the sensors make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_drbpn.functional import (
+    Belief,
+    MeanNetwork,
+    full_cov,
+    inverse_softplus,
+    positive_std,
+)
+
+__all__ = ["GaussianTransition", "LinearGaussianEmission"]
+
+CovKind = Literal["diag", "full"]
+
+
+def _check_dim(name: str, value: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"`{name}` must be an int of at least 1, got {value!r}.")
+    return value
+
+
+def _check_std(init_std: float, min_std: float) -> None:
+    if not 0 < min_std < init_std:
+        raise ValueError(
+            f"`min_std` and `init_std` must satisfy 0 < min_std < init_std, got min_std={min_std} "
+            f"and init_std={init_std}: the floor keeps the likelihood bounded, and the start must "
+            "lie above it."
+        )
+
+
+def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}.")
+
+
+class _Covariance(nn.Module):
+    """A learned covariance, diagonal or full, whose standard deviations have a floor."""
+
+    def __init__(
+        self,
+        dim: int,
+        kind: CovKind,
+        init_std: float,
+        min_std: float,
+        device: torch.device | str | None,
+        dtype: torch.dtype | None,
+    ) -> None:
+        super().__init__()
+        _check_choice("cov", kind, ("diag", "full"))
+        _check_std(init_std, min_std)
+        self.kind, self.min_std = kind, min_std
+        raw = torch.zeros(dim, device=device, dtype=dtype)
+        if kind == "diag":
+            raw = raw + inverse_softplus(torch.tensor(init_std - min_std, device=device))
+        else:
+            spread = torch.tensor(init_std**2 - min_std**2, device=device).sqrt()
+            raw = torch.diag_embed(raw + inverse_softplus(spread))
+        self.raw = nn.Parameter(raw.to(dtype or torch.get_default_dtype()))
+
+    def variance(self) -> Tensor:
+        """Return the variances, shape (dim,); a diagonal covariance only."""
+        return positive_std(self.raw, self.min_std).square()
+
+    def forward(self) -> Tensor:
+        """Return the covariance, shape (dim, dim)."""
+        if self.kind == "diag":
+            return self.variance().diag()
+        return full_cov(self.raw, self.min_std)
+
+
+def initial_covariance(
+    dim: int,
+    kind: CovKind,
+    init_std: float,
+    device: torch.device | str | None,
+    dtype: torch.dtype | None,
+) -> nn.Module:
+    """Make the learned covariance of the initial belief; calling it returns ``(dim, dim)``."""
+    return _Covariance(dim, kind, init_std, min_std=1e-3, device=device, dtype=dtype)
+
+
+class GaussianTransition(nn.Module):
+    r"""Predict the next latent state from the last one and the action.
+
+    .. math:: s_t \sim N(f^\mu(s_{t-1}, a_{t-1}), Q)
+
+    Eq. (2) and (8) [DRBPN]. f is a network of (mean, action), added to the mean where
+    ``residual``. Q is a free parameter (the paper's runs) or a network of (mean, action)
+    (eq. 8), diagonal or full, with a floor on its standard deviations.
+
+    A constant Q opens the fast forms of the filter; a network Q makes the covariances depend on
+    the past, so the filter runs step by step.
+
+    Args:
+        state_dim: number of latent components.
+        action_dim: number of action components.
+
+    Keyword Args:
+        hidden_sizes: widths of the hidden layers of f (and of the network Q).
+        activation: "relu" or "tanh".
+        residual: whether f predicts the change of the mean. With state > obs the directions
+            that no sensor sees become integrators and diverge: use False there, as
+            :class:`~torchrl_drbpn.BeliefFilter` does by default.
+        cov: "diag" or "full".
+        cov_network: whether Q is a network of (mean, action).
+        init_std: standard deviation Q starts from, state units.
+        min_std: floor of the standard deviation, state units.
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Raises:
+        ValueError: for a dimension under 1, an unknown choice, or a floor above the start.
+
+    Example:
+        >>> import torch
+        >>> transition = GaussianTransition(state_dim=3, action_dim=2)
+        >>> belief = transition(torch.zeros(5, 3), torch.zeros(5, 2))
+        >>> belief.mean.shape, belief.cov.shape
+        (torch.Size([5, 3]), torch.Size([5, 3, 3]))
+
+    See also :func:`torchrl_drbpn.functional.predict`.
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        hidden_sizes: Sequence[int] = (64, 64),
+        activation: str = "relu",
+        residual: bool = True,
+        cov: CovKind = "diag",
+        cov_network: bool = False,
+        init_std: float = 0.3,
+        min_std: float = 1e-3,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        self.state_dim = _check_dim("state_dim", state_dim)
+        self.action_dim = _check_dim("action_dim", action_dim)
+        _check_choice("activation", activation, ("relu", "tanh"))
+        _check_choice("cov", cov, ("diag", "full"))
+        _check_std(init_std, min_std)
+        self.residual, self.activation = residual, activation
+        self.cov_kind, self.min_std = cov, min_std
+
+        def network(out_features: int) -> nn.ModuleList:
+            sizes = [state_dim + action_dim, *hidden_sizes, out_features]
+            return nn.ModuleList(
+                nn.Linear(i, o, device=device, dtype=dtype)
+                for i, o in zip(sizes[:-1], sizes[1:], strict=True)
+            )
+
+        self.layers = network(state_dim)
+        self.cov_layers: nn.ModuleList | None = None
+        self.noise: _Covariance | None = None
+        if cov_network:
+            self.cov_layers = network(state_dim if cov == "diag" else state_dim * state_dim)
+            with torch.no_grad():
+                # Start from the constant init_std: the last layer begins with the bias alone.
+                start = _Covariance(state_dim, cov, init_std, min_std, device, dtype).raw
+                last = self.cov_layers[-1]
+                last.weight.zero_()
+                last.bias.copy_(start.flatten())
+        else:
+            self.noise = _Covariance(state_dim, cov, init_std, min_std, device, dtype)
+
+    def mean_network(self) -> MeanNetwork:
+        """Return f as tensors, as the fast filter wants it."""
+        return MeanNetwork(
+            tuple(layer.weight for layer in self.layers),
+            tuple(layer.bias for layer in self.layers),
+            self.residual,
+            self.activation,
+        )
+
+    @property
+    def constant_cov(self) -> bool:
+        """Whether Q is a free parameter rather than a network."""
+        return self.noise is not None
+
+    def cov(self, mean: Tensor | None = None, action: Tensor | None = None) -> Tensor:
+        """Return Q.
+
+        Args:
+            mean: shape ``(*batch, state)``; needed where Q is a network.
+            action: shape ``(*batch, action)``; needed where Q is a network.
+
+        Returns:
+            ``(state, state)`` for a constant Q, else ``(*batch, state, state)``.
+
+        Raises:
+            ValueError: if Q is a network and mean or action is missing.
+        """
+        if self.noise is not None:
+            return self.noise()
+        if mean is None or action is None or self.cov_layers is None:
+            raise ValueError("`mean` and `action` are needed: this Q is a network of both.")
+        raw = MeanNetwork(
+            tuple(layer.weight for layer in self.cov_layers),
+            tuple(layer.bias for layer in self.cov_layers),
+            False,
+            self.activation,
+        )(mean, action)
+        if self.cov_kind == "diag":
+            return torch.diag_embed(positive_std(raw, self.min_std).square())
+        return full_cov(raw.unflatten(-1, (self.state_dim, self.state_dim)), self.min_std)
+
+    def forward(self, mean: Tensor, action: Tensor) -> Belief:
+        """Return the predicted belief.
+
+        Args:
+            mean: filtered mean of the step before, shape ``(*batch, state)``.
+            action: previous action, shape ``(*batch, action)``.
+
+        Returns:
+            ``Belief(mean, cov)`` of shapes ``(*batch, state)``, ``(*batch, state, state)``.
+        """
+        predicted = self.mean_network()(mean, action)
+        cov = self.cov(mean, action)
+        return Belief(predicted, cov.expand(*predicted.shape, self.state_dim))
+
+
+class LinearGaussianEmission(nn.Module):
+    r"""Say what the sensors read when the state is s and the last action was a.
+
+    .. math:: x_t = H s_t + B a_{t-1} + d + \epsilon, \qquad \epsilon \sim N(0, R)
+
+    Eq. (3) [DRBPN]. H starts as the identity (its first columns or rows where the dimensions
+    differ), B and d at zero. R's standard deviations have a floor, so that the likelihood is
+    bounded: on clean data R shrinks without end otherwise.
+
+    Args:
+        obs_dim: number of sensor components.
+        state_dim: number of latent components.
+        action_dim: number of action components.
+
+    Keyword Args:
+        cov: "diag" or "full", the kind of R. A diagonal R opens the information form.
+        init_std: standard deviation R starts from, observation units.
+        min_std: floor of the standard deviation, observation units.
+        fixed_matrix: keep H = [I 0]; loses no generality where state >= obs, and keeps the
+            state's units those of the observation.
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Raises:
+        ValueError: for a dimension under 1, an unknown choice, a floor above the start, or
+            ``fixed_matrix`` with state < obs.
+
+    Example:
+        >>> import torch
+        >>> emission = LinearGaussianEmission(obs_dim=4, state_dim=3, action_dim=2)
+        >>> emission(torch.zeros(5, 3), torch.zeros(5, 2)).shape
+        torch.Size([5, 4])
+    """
+
+    def __init__(
+        self,
+        obs_dim: int,
+        state_dim: int,
+        action_dim: int,
+        *,
+        cov: CovKind = "diag",
+        init_std: float = 0.1,
+        min_std: float = 1e-2,
+        fixed_matrix: bool = False,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        self.obs_dim = _check_dim("obs_dim", obs_dim)
+        self.state_dim = _check_dim("state_dim", state_dim)
+        self.action_dim = _check_dim("action_dim", action_dim)
+        if fixed_matrix and state_dim < obs_dim:
+            raise ValueError(
+                "`fixed_matrix` needs state_dim >= obs_dim, since H = [I 0] must reach every "
+                f"sensor; got state_dim={state_dim}, obs_dim={obs_dim}."
+            )
+        matrix = torch.eye(obs_dim, state_dim, device=device, dtype=dtype)
+        self.matrix: Tensor
+        if fixed_matrix:
+            self.register_buffer("matrix", matrix)
+        else:
+            self.matrix = nn.Parameter(matrix)
+        self.action_matrix = nn.Parameter(
+            torch.zeros(obs_dim, action_dim, device=device, dtype=dtype)
+        )
+        self.offset = nn.Parameter(torch.zeros(obs_dim, device=device, dtype=dtype))
+        self.noise = _Covariance(obs_dim, cov, init_std, min_std, device, dtype)
+
+    def cov(self) -> Tensor:
+        """Return R, shape ``(obs, obs)``."""
+        return self.noise()
+
+    def compact_cov(self) -> Tensor:
+        """Return the variances ``(obs,)`` of a diagonal R, the matrix ``(obs, obs)`` of a full."""
+        return self.noise.variance() if self.noise.kind == "diag" else self.noise()
+
+    def forward(self, state: Tensor, previous_action: Tensor) -> Tensor:
+        """Return the expected observation.
+
+        Args:
+            state: shape ``(*batch, state)``.
+            previous_action: shape ``(*batch, action)``.
+
+        Returns:
+            Shape ``(*batch, obs)``, observation units.
+        """
+        offset = nn.functional.linear(previous_action, self.action_matrix, self.offset)
+        return state @ self.matrix.mT + offset

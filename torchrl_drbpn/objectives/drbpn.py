@@ -1,0 +1,236 @@
+"""DRBPN's loss: PPO on beliefs plus the model's likelihood, from one filter pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams, unravel_key
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.common import LossModule
+from torchrl.objectives.utils import ValueEstimators
+
+from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, last_steps
+
+__all__ = ["DRBPNLoss"]
+
+
+class DRBPNLoss(LossModule):
+    r"""Run the belief module once, then the PPO loss and the model loss on what it wrote.
+
+    .. math:: L = L^{objective} + \lambda_v L^{critic} + \lambda_m L^{model}
+
+    Eq. (13) [DRBPN]: one pass, and all gradients reach the filter. The two losses are held, not
+    subclassed; the actor and the critic of ``ppo_loss`` are heads that read what the belief
+    module writes (``features``). ``loss_model`` comes out weighted by ``model_coeff``, as
+    ``loss_critic`` does by its coefficient, so the sum of all ``loss_*`` is the total.
+
+    The input is a batch of sequences, ``[*batch, time]``, cut from rollouts, with the stored
+    recurrent state: each sequence starts from the belief the collector stored there. Where an
+    episode ends, or ``final`` says that the rollout was cut, the next observation's likelihood
+    is added by one more step of the belief module.
+
+    Args:
+        filter_module: a belief module, such as :class:`~torchrl_drbpn.BeliefFilterModule`.
+        ppo_loss: TorchRL's ClipPPOLoss over heads.
+        model_loss: the model loss, None for belief modules without a likelihood.
+
+    Keyword Args:
+        model_coeff: lambda_m, at least 0; ``loss.model_coeff = 0.3`` changes it in place.
+        detach_belief: keep PPO's gradient out of the filter.
+
+    Raises:
+        ValueError: for a negative coefficient.
+        KeyError: if advantages are not in the tensordict.
+
+    Example:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule as Mod, ProbabilisticTensorDictSequential
+        >>> from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictModule
+        >>> from torchrl.modules import ValueOperator, IndependentNormal
+        >>> from torchrl_drbpn import BeliefFilter, BeliefFilterModule, BeliefModelLoss
+        >>> belief = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
+        >>> head = torch.nn.Sequential(torch.nn.Linear(5, 4), NormalParamExtractor())
+        >>> actor = ProbabilisticTensorDictSequential(
+        ...     Mod(head, in_keys=["features"], out_keys=["loc", "scale"]),
+        ...     ProbabilisticTensorDictModule(["loc", "scale"], ["action"],
+        ...         distribution_class=IndependentNormal, return_log_prob=True))
+        >>> critic = ValueOperator(torch.nn.Linear(5, 1), in_keys=["features"])
+        >>> loss = DRBPNLoss(belief, ClipPPOLoss(actor, critic), BeliefModelLoss())
+        >>> sorted(key for key in loss.out_keys if key.startswith("loss"))
+        ['loss_critic', 'loss_entropy', 'loss_model', 'loss_objective']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Name the entries read; those of the held losses are passed on to them."""
+
+        advantage: NestedKey = "advantage"
+        value_target: NestedKey = "value_target"
+        value: NestedKey = "state_value"
+        sample_log_prob: NestedKey = "action_log_prob"
+        action: NestedKey = "action"
+        features: NestedKey = "features"
+        log_likelihood: NestedKey = ("belief", "log_likelihood")
+        observed: NestedKey = "observed"
+        next_log_likelihood: NestedKey = ("next", "belief", "log_likelihood")
+        next_observed: NestedKey = ("next", "observed")
+        done: NestedKey = ("next", "done")
+        final: NestedKey = "final"
+        is_init: NestedKey = "is_init"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    filter_network: TensorDictModuleBase
+    filter_network_params: TensorDictParams
+    target_filter_network_params: TensorDictParams
+    _schedulable_buffers = frozenset({"model_coeff"})
+
+    def __init__(
+        self,
+        filter_module: TensorDictModuleBase,
+        ppo_loss: ClipPPOLoss,
+        model_loss: BeliefModelLoss | None,
+        *,
+        model_coeff: float = 1.0,
+        detach_belief: bool = False,
+    ) -> None:
+        super().__init__()
+        if model_coeff < 0:
+            raise ValueError(f"`model_coeff` must be at least 0, got {model_coeff}.")
+        self.convert_to_functional(filter_module, "filter_network")
+        self.ppo_loss = ppo_loss
+        self.model_loss = model_loss
+        self.detach_belief = detach_belief
+        self.register_coeff_buffer("model_coeff", model_coeff)
+
+    # ------------------------------------------------------------------ keys
+    def set_keys(self, **kwargs: Any) -> None:
+        """Rename entries, here and in the held losses.
+
+        Args:
+            kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default.
+
+        Raises:
+            ValueError: for an unknown name.
+        """
+        mine = {f.name for f in fields(self._AcceptedKeys)}
+        unknown = sorted(set(kwargs) - mine)
+        if unknown:
+            raise ValueError(f"{unknown} are no keys of DRBPNLoss; it accepts {sorted(mine)}.")
+        super().set_keys(**kwargs)
+        for part in (self.ppo_loss, self.model_loss):
+            if part is not None:
+                accepted = {f.name for f in fields(part.default_keys)}
+                its = {
+                    # PPO names the entry inside "next", the model loss from the root.
+                    name: key[1:] if name == "done" and key and part is self.ppo_loss else key
+                    for name, key in kwargs.items()
+                    if name in accepted
+                }
+                part.set_keys(**its)
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        """Do nothing: the held PPO loss owns the value estimator."""
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries read: the belief module's, its next step's, and those of PPO."""
+        keys = self.tensor_keys
+        belief = list(self.filter_network.in_keys)
+        following = [unravel_key(("next", key)) for key in belief]
+        written = {unravel_key(key) for key in self.filter_network.out_keys}
+        read = [
+            *belief,
+            *(key for key in following if key not in written),
+            keys.done,
+            keys.final,
+            keys.action,
+            keys.sample_log_prob,
+            keys.advantage,
+            keys.value_target,
+        ]
+        return list(dict.fromkeys(read))
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        del value
+        raise RuntimeError("the in_keys follow from the held modules: use set_keys to rename one.")
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries written: the PPO loss's and the model loss's."""
+        model = [] if self.model_loss is None else self.model_loss.out_keys
+        return [*self.ppo_loss.out_keys, *model]
+
+    @out_keys.setter
+    def out_keys(self, value: list[NestedKey]) -> None:
+        del value
+        raise RuntimeError("the out_keys follow from the held losses.")
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+    ) -> None:
+        """Pass on to the PPO loss.
+
+        Args:
+            value_type: as in TorchRL's losses.
+            hyperparams: of the estimator.
+        """
+        self.ppo_loss.make_value_estimator(value_type, **hyperparams)
+
+    # ------------------------------------------------------------------ forward
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the PPO terms, ``loss_model`` (weighted), and the metrics of both."""
+        keys = self.tensor_keys
+        if tensordict.get(keys.advantage, None) is None:
+            raise KeyError(
+                f"`{keys.advantage}` is not in the tensordict: compute advantages over the whole "
+                "rollout first (TorchRL's GAE), then cut it into minibatches."
+            )
+        data = tensordict.copy()
+        with self.filter_network_params.to_module(
+            self.filter_network, preserve_module_state=False
+        ):
+            self.filter_network(data)
+            if self.model_loss is not None:
+                self._add_last_observations(data)
+
+        model = None if self.model_loss is None else self.model_loss(data)
+        if self.detach_belief:
+            data.set(keys.features, data.get(keys.features).detach())
+        out = self.ppo_loss(data)
+        if model is not None:
+            for name, value in model.items():
+                out.set(name, self.model_coeff * value if name == "loss_model" else value)
+        return out
+
+    def _add_last_observations(self, data: TensorDictBase) -> None:
+        """Write the likelihood of the next observation where no root step holds it.
+
+        Only those few steps are gathered: a masked pass over all of them would factorise twice as
+        many matrices as the filter itself.
+        """
+        keys = self.tensor_keys
+        inputs = [unravel_key(("next", key)) for key in self.filter_network.in_keys]
+        following = data.select(*inputs, strict=False).get("next", None)
+        log_likelihood = data.get(keys.log_likelihood)
+        if following is None or data.get(keys.next_observed, None) is None:
+            return
+        where = last_steps(
+            data, done=keys.done, final=keys.final, like=log_likelihood
+        ).nonzero(as_tuple=True)
+        gathered = following[where]
+        # A collector writes next.is_init = False; a belief that goes on is what is wanted here.
+        gathered.set(keys.is_init, torch.zeros(*gathered.shape, 1, dtype=torch.bool, device=log_likelihood.device))
+        with set_recurrent_mode(False):
+            self.filter_network(gathered)
+        data.set(
+            keys.next_log_likelihood,
+            torch.zeros_like(log_likelihood).index_put(where, gathered.get(keys.log_likelihood)),
+        )
