@@ -300,11 +300,11 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
         >>> import torch
         >>> eye = torch.eye(2)
         >>> model = StateSpace(
-        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     lambda m, a: m, eye, eye, 3 * torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
         ...     torch.zeros(2), eye)
         >>> seen = torch.tensor([True, False])
         >>> filtered_cov(model, seen, torch.tensor(False)).tolist()
-        [[0.5, 0.0], [0.0, 1.0]]
+        [[0.75, 0.0], [0.0, 1.0]]
     """
     if not isinstance(model.transition_cov, Tensor):
         raise ValueError(

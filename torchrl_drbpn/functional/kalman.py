@@ -134,9 +134,9 @@ def update(
         >>> import torch
         >>> belief = Belief(torch.zeros(2), torch.eye(2))
         >>> seen = torch.tensor([True, False])
-        >>> mean, cov = update(belief, torch.ones(2), seen, torch.eye(2), torch.eye(2))
+        >>> mean, cov = update(belief, torch.ones(2), seen, torch.eye(2), 3 * torch.eye(2))
         >>> mean.tolist(), cov.tolist()
-        ([0.5, 0.0], [[0.5, 0.0], [0.0, 1.0]])
+        ([0.25, 0.0], [[0.75, 0.0], [0.0, 1.0]])
     """
     H = emission_matrix
     v, S = innovation(belief, observation, observed, H, emission_cov, offset)

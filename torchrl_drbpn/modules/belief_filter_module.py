@@ -215,6 +215,12 @@ class BeliefFilterModule(TensorDictModuleBase):
             ("belief", "innovation_cov"): cov,
         }
 
+    @property
+    def feature_dim(self) -> int:
+        """Width of ``features``, for building the heads that read it."""
+        state = self.filter.state_dim
+        return state if self.policy_input == "mean" else state + state * (state + 1) // 2
+
     # ------------------------------------------------------------------ modes and primer
     @property
     def recurrent_mode(self) -> bool:

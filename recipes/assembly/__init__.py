@@ -1,0 +1,1 @@
+"""Parts of the recipes: one job each, plain arguments, no Hydra."""

@@ -1,0 +1,131 @@
+"""The agent: belief module, policy head, value head, and the loss that trains them."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    AddStateIndependentNormalScale,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import nn
+from torchrl.envs import TransformedEnv
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules.utils import get_primers_from_module
+from torchrl.objectives import ClipPPOLoss, LossModule
+
+from assembly.beliefs import Belief
+from assembly.settings import HeadSettings, LossSettings
+from torchrl_drbpn import DRBPNLoss
+
+
+class Agent(nn.Module):
+    """Hold a belief module and the two heads that read its features.
+
+    Args:
+        belief: the belief module and what belongs to it.
+        action_dim: components of an action.
+        heads: sizes and initialisation of the heads.
+
+    Attributes:
+        belief: the belief module.
+        actor: the policy head, a distribution over actions given ``features``.
+        critic: the value head, ``state_value`` given ``features``.
+        policy: belief module, then policy head.
+        model_loss: the loss of the belief's own model, or None.
+    """
+
+    def __init__(self, belief: Belief, action_dim: int, heads: HeadSettings) -> None:
+        super().__init__()
+        self.belief = belief.module
+        self.model_loss = belief.model_loss
+        sizes = [belief.feature_dim, *heads.hidden]
+        location = _mlp([*sizes, action_dim], heads.hidden_gain, heads.policy_gain)
+        scale = AddStateIndependentNormalScale(action_dim)
+        nn.init.constant_(scale.state_independent_scale, heads.log_std)
+        self.actor = ProbabilisticActor(
+            TensorDictModule(
+                nn.Sequential(location, scale), in_keys=["features"], out_keys=["loc", "scale"]
+            ),
+            in_keys=["loc", "scale"],
+            distribution_class=IndependentNormal,
+            return_log_prob=True,
+        )
+        value = _mlp([*sizes, 1], heads.hidden_gain, heads.value_gain)
+        self.critic = ValueOperator(value, in_keys=["features"])
+        # Not registered a second time: its parts are above.
+        self.__dict__["policy"] = TensorDictSequential(self.belief, self.actor)
+
+    policy: TensorDictSequential
+
+    def make_loss(self, settings: LossSettings) -> LossModule:
+        """Build the loss: PPO and, where the belief has a model, its likelihood.
+
+        Args:
+            settings: its coefficients.
+
+        Returns:
+            A loss whose outputs named ``loss*`` are to be summed.
+        """
+        ppo = ClipPPOLoss(
+            self.actor,
+            self.critic,
+            clip_epsilon=settings.clip_epsilon,
+            entropy_bonus=settings.entropy_coeff > 0,
+            entropy_coeff=settings.entropy_coeff,
+            critic_coeff=settings.critic_coeff,
+            loss_critic_type=settings.loss_critic_type,
+            normalize_advantage=settings.normalize_advantage,
+        )
+        return DRBPNLoss(
+            self.belief,
+            ppo,
+            self.model_loss,
+            model_coeff=settings.model_coeff,
+            detach_belief=settings.detach_belief,
+        )
+
+    @torch.no_grad()
+    def next_value(self, next_tensordict: TensorDictBase) -> torch.Tensor:
+        """Return V of the beliefs that follow, one step ahead of every stored step.
+
+        The stored next step holds what arrived, the action before it and the belief before it, so
+        one batched step of the belief module gives every next belief at once: no second pass over
+        time, and truncated and terminal steps have theirs too.
+
+        Args:
+            next_tensordict: ``data["next"]``, any shape.
+
+        Returns:
+            Values, shape ``(*, 1)``.
+        """
+        single = next_tensordict.select(*self.belief.in_keys, strict=False)
+        features = self.belief(single.reshape(-1)).get("features")
+        return self.critic.module(features).reshape(*next_tensordict.shape, 1)
+
+
+def _mlp(sizes: list[int], hidden_gain: float, last_gain: float) -> nn.Sequential:
+    """Build a tanh network with orthogonal weights and zero biases."""
+    layers: list[nn.Module] = []
+    for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+        last = i == len(sizes) - 2
+        linear = nn.Linear(inputs, outputs)
+        nn.init.orthogonal_(linear.weight, last_gain if last else hidden_gain)
+        nn.init.zeros_(linear.bias)
+        layers += [linear] if last else [linear, nn.Tanh()]
+    return nn.Sequential(*layers)
+
+
+def add_primers(env: TransformedEnv, agent: Agent) -> None:
+    """Append the entries of the belief module's recurrent state to an environment.
+
+    Args:
+        env: the environment; changed in place.
+        agent: whose belief module may be recurrent.
+    """
+    primers = get_primers_from_module(agent.belief, warn=False)
+    if primers is not None:
+        env.append_transform(primers)

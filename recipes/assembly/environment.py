@@ -1,0 +1,143 @@
+"""The environment of a run: simulators, corruption, normalisation, in the order they need."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchrl.envs import (
+    Compose,
+    InitTracker,
+    RewardSum,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
+
+from assembly.errors import UserError
+from assembly.settings import (
+    EnvSettings,
+    MissingnessSettings,
+    NoiseSettings,
+    NormalisationSettings,
+)
+from torchrl_drbpn import (
+    MaskedObservationNorm,
+    ObservationMissingness,
+    ObservationNoise,
+    PreviousAction,
+    RunningReturnScale,
+    seed_env,
+)
+from torchrl_drbpn.envs import GymnasiumBatchEnv
+
+
+def make_environment(
+    env: EnvSettings,
+    missingness: MissingnessSettings,
+    noise: NoiseSettings,
+    normalisation: NormalisationSettings,
+    *,
+    num_envs: int,
+    num_threads: int,
+    gamma: float,
+    seed: int,
+    before_normalisation: Sequence[Transform] = (),
+) -> TransformedEnv:
+    """Build the batched, corrupted, normalised environment of a run.
+
+    Args:
+        env: which robot.
+        missingness: which entries of an observation do not arrive.
+        noise: what is added to the entries that arrive.
+        normalisation: clips of the running statistics.
+        num_envs: simulators in the batch.
+        num_threads: threads that step them; results do not depend on it.
+        gamma: discount of the return whose deviation scales the reward.
+        seed: seed of episodes and corruption.
+        before_normalisation: further transforms that a belief module asks for.
+
+    Returns:
+        The environment, batch size ``(num_envs,)``. The recurrent state's primer is not in it:
+        :func:`assembly.agent.add_primers` appends it.
+
+    Raises:
+        UserError: if the environment does not exist or has unsuitable actions or observations.
+    """
+    base = _make_base(env, num_envs, num_threads)
+    transforms: list[Transform] = [PreviousAction()]
+    if noise.sigma > 0:
+        transforms.append(ObservationNoise(noise.scale * noise.sigma))
+    # "none" still writes `observed`: every entry is there.
+    none = missingness.mechanism == "none"
+    transforms += [
+        ObservationMissingness(
+            "mcar" if none else missingness.mechanism,
+            0.0 if none else missingness.eta,
+            always_observed=missingness.always_observed,
+            mechanism_seed=missingness.mechanism_seed,
+        ),
+        *before_normalisation,
+        MaskedObservationNorm(clip=normalisation.observation_clip),
+        RunningReturnScale(
+            gamma=gamma,
+            clip=normalisation.reward_clip,
+            in_keys=["reward"],
+            out_keys=["scaled_reward"],
+        ),
+        RewardSum(in_keys=["reward"], out_keys=["episode_reward"]),
+        StepCounter(),
+        InitTracker(),
+    ]
+    out = TransformedEnv(base, Compose(*transforms))
+    seed_env(out, seed)
+    return out
+
+
+def task_dims(env: EnvSettings) -> tuple[int, int]:
+    """Return the sizes of a task.
+
+    Args:
+        env: which robot.
+
+    Returns:
+        Components of an observation and of an action.
+
+    Raises:
+        UserError: if the environment does not exist or has unsuitable actions or observations.
+    """
+    base = _make_base(env, 1, 1)
+    dims = base.observation_spec["observation"].shape[-1], base.action_spec.shape[-1]
+    base.close()
+    return dims
+
+
+def _make_base(env: EnvSettings, num_envs: int, num_threads: int) -> GymnasiumBatchEnv:
+    """Build the simulators; what can't be used is the user's to mend."""
+    try:
+        return GymnasiumBatchEnv(env.env_id, num_envs, num_threads=num_threads)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+
+
+def normalisers(env: TransformedEnv) -> list[Transform]:
+    """Return the transforms of an environment that learn statistics.
+
+    Args:
+        env: the environment.
+
+    Returns:
+        Its observation and reward normalisers.
+    """
+    return [t for t in env.transform if isinstance(t, (MaskedObservationNorm, RunningReturnScale))]
+
+
+def copy_statistics(source: TransformedEnv, target: TransformedEnv) -> None:
+    """Give an environment the frozen statistics of another.
+
+    Args:
+        source: the environment that learned them.
+        target: the environment that uses them; it learns no more.
+    """
+    for learned, frozen in zip(normalisers(source), normalisers(target), strict=True):
+        frozen.load_state_dict(learned.state_dict())
+        frozen.freeze()

@@ -1,0 +1,172 @@
+"""Evaluation: the first episode of each environment of a batch, with frozen statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from assembly.agent import Agent, add_primers
+from assembly.beliefs import Belief
+from assembly.environment import copy_statistics, make_environment
+from assembly.settings import MissingnessSettings, NoiseSettings, Settings
+from torchrl_drbpn import seed_env
+
+_KINDS = {"sampled": ExplorationType.RANDOM, "mean": ExplorationType.DETERMINISTIC}
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Whole episodes of one policy under one corruption.
+
+    Attributes:
+        returns: sum of raw rewards of each episode.
+        lengths: steps of each episode.
+        missing_ratios: share of entries that did not arrive in each, over all components.
+        log_likelihoods: nats per observed entry in each, normalised units; None without a model.
+    """
+
+    returns: list[float]
+    lengths: list[int]
+    missing_ratios: list[float]
+    log_likelihoods: list[float] | None
+
+    @property
+    def mean_return(self) -> float:
+        """Return the mean of the returns."""
+        return sum(self.returns) / len(self.returns)
+
+    @property
+    def std_return(self) -> float:
+        """Return the standard deviation of the returns between episodes; 0 for one episode."""
+        if len(self.returns) < 2:
+            return 0.0
+        return torch.tensor(self.returns, dtype=torch.float64).std().item()
+
+    @property
+    def missing_ratio(self) -> float:
+        """Return the share of entries that did not arrive, over all steps and components."""
+        steps = sum(self.lengths)
+        return sum(r * n for r, n in zip(self.missing_ratios, self.lengths, strict=True)) / steps
+
+    @property
+    def log_likelihood(self) -> float | None:
+        """Return the nats per observed entry over all steps; None without a model."""
+        if self.log_likelihoods is None:
+            return None
+        ratios = zip(self.missing_ratios, self.lengths, strict=True)
+        weights = [(1 - ratio) * length for ratio, length in ratios]
+        total = sum(v * w for v, w in zip(self.log_likelihoods, weights, strict=True))
+        return total / max(sum(weights), 1.0)
+
+
+def make_evaluation_environment(
+    settings: Settings,
+    belief: Belief,
+    agent: Agent,
+    *,
+    episodes: int,
+    missingness: MissingnessSettings | None = None,
+    noise: NoiseSettings | None = None,
+) -> TransformedEnv:
+    """Build an environment like the training one, one simulator an episode.
+
+    Args:
+        settings: of the run.
+        belief: whose transforms are needed.
+        agent: whose recurrent state is carried.
+        episodes: number of episodes.
+        missingness: what does not arrive; None: as in training.
+        noise: what is added; None: as in training.
+
+    Returns:
+        The environment. Its statistics are empty: see
+        :func:`assembly.environment.copy_statistics`.
+    """
+    env = make_environment(
+        settings.env,
+        missingness or settings.missingness,
+        noise or settings.noise,
+        settings.normalisation,
+        num_envs=episodes,
+        num_threads=settings.collector.num_threads,
+        gamma=settings.loss.gamma,
+        seed=settings.evaluation.seed,
+        before_normalisation=belief.transforms(),
+    )
+    add_primers(env, agent)
+    return env
+
+
+def evaluate(
+    policy: TensorDictModuleBase,
+    env: TransformedEnv,
+    *,
+    mode: str,
+    seed: int,
+    statistics: TransformedEnv | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Episodes | None:
+    """Run the first episode of each environment of a batch.
+
+    Only first episodes count, so that short episodes are not over-represented. The global
+    generator is left as it was found.
+
+    Args:
+        policy: belief module and policy head.
+        env: batch size ``(episodes,)``.
+        mode: ``sampled`` actions or ``mean`` actions.
+        seed: of episodes, corruption and sampled actions.
+        statistics: environment whose normalisation is used, frozen; None: that of ``env``.
+        stop: asked at every step; if it returns True the evaluation is given up.
+
+    Returns:
+        The episodes, or None if it was given up.
+    """
+    if statistics is not None:
+        copy_statistics(statistics, env)
+    with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(_KINDS[mode]):
+        torch.manual_seed(seed)
+        seed_env(env, seed)
+        return _first_episodes(policy, env, stop)
+
+
+def _first_episodes(
+    policy: TensorDictModuleBase, env: TransformedEnv, stop: Callable[[], bool]
+) -> Episodes | None:
+    """Step all environments until each has finished once."""
+    count = env.batch_size[0]
+    running = torch.ones(count, 1, dtype=torch.bool)
+    returns = torch.zeros(count, 1, dtype=torch.float64)
+    lengths = torch.zeros(count, 1, dtype=torch.int64)
+    observed = torch.zeros(count, 1, dtype=torch.int64)
+    log_likelihood = torch.zeros(count, 1, dtype=torch.float64)
+    components, has_model = 0, False
+    root = env.reset()
+    while running.any():
+        if stop():
+            return None
+        stepped, following = env.step_and_maybe_reset(policy(root))
+        mask = stepped.get("observed")
+        components = mask.shape[-1]
+        observed += mask.sum(-1, keepdim=True) * running
+        value = stepped.get(("belief", "log_likelihood"), None)
+        if value is not None:
+            has_model = True
+            log_likelihood += value.reshape(count, 1) * running
+        returns += stepped.get(("next", "reward")) * running
+        lengths += running
+        running = running & ~stepped.get(("next", "done"))
+        root = following
+    missing = 1 - observed / (lengths * components).double()
+    per_entry = log_likelihood / observed.clamp_min(1)
+    return Episodes(
+        returns.squeeze(-1).tolist(),
+        lengths.squeeze(-1).tolist(),
+        missing.squeeze(-1).tolist(),
+        per_entry.squeeze(-1).tolist() if has_model else None,
+    )

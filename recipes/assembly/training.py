@@ -1,0 +1,297 @@
+"""Training: collect, value, update; one path for every belief module."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+from torchrl.objectives import LossModule
+from torchrl.objectives.value import GAE
+
+from assembly.agent import Agent, add_primers
+from assembly.beliefs import Belief, build_belief
+from assembly.environment import make_environment, task_dims
+from assembly.errors import UserError
+from assembly.rollout import (
+    add_advantages,
+    explained_variance,
+    log_likelihood_per_entry,
+    minibatches,
+    realised_missing_ratio,
+    to_sequences,
+)
+from assembly.settings import OptimSettings, Settings
+
+_RECENT_EPISODES = 100
+
+
+@dataclass
+class Progress:
+    """Counters of a run.
+
+    Attributes:
+        frames: environment steps so far.
+        episodes: finished episodes so far.
+        returns: raw returns of the latest finished episodes.
+        train_seconds: time in collection and update.
+        evaluated_frames: frames at the last evaluation; -1 before the first one.
+    """
+
+    frames: int = 0
+    episodes: int = 0
+    returns: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT_EPISODES))
+    train_seconds: float = 0.0
+    evaluated_frames: int = -1
+
+
+@dataclass
+class Training:
+    """Everything that changes while a run trains."""
+
+    belief: Belief
+    agent: Agent
+    env: TransformedEnv
+    collector: Collector
+    loss: LossModule
+    gae: GAE
+    optimizer: torch.optim.Optimizer
+    generator: torch.Generator
+    progress: Progress
+
+
+def assemble(settings: Settings) -> Training:
+    """Build everything a run needs, from its seed.
+
+    The global generator of torch is seeded here: initial weights and sampled actions come from it.
+
+    Args:
+        settings: of the run.
+
+    Returns:
+        The parts, before the first frame.
+
+    Raises:
+        UserError: if the environment or the belief refuses its settings.
+    """
+    torch.manual_seed(settings.seed)
+    belief, agent = make_agent(settings)
+    env = make_environment(
+        settings.env,
+        settings.missingness,
+        settings.noise,
+        settings.normalisation,
+        num_envs=settings.collector.num_envs,
+        num_threads=settings.collector.num_threads,
+        gamma=settings.loss.gamma,
+        seed=settings.seed,
+        before_normalisation=belief.transforms(),
+    )
+    add_primers(env, agent)
+    collector = Collector(
+        env,
+        agent.policy,
+        frames_per_batch=settings.collector.frames,
+        total_frames=-1,
+        track_traj_ids=False,
+        use_buffers=False,
+        auto_register_policy_transforms=False,
+    )
+    gae = GAE(gamma=settings.loss.gamma, lmbda=settings.loss.lmbda, value_network=None)
+    gae.set_keys(reward="scaled_reward")
+    optimizer = torch.optim.Adam(
+        agent.parameters(), lr=settings.optim.lr, eps=settings.optim.eps, fused=True
+    )
+    return Training(
+        belief=belief,
+        agent=agent,
+        env=env,
+        collector=collector,
+        loss=agent.make_loss(settings.loss),
+        gae=gae,
+        optimizer=optimizer,
+        generator=torch.Generator().manual_seed(settings.seed),
+        progress=Progress(),
+    )
+
+
+def make_agent(settings: Settings) -> tuple[Belief, Agent]:
+    """Build belief module and heads, with weights from torch's global generator.
+
+    Args:
+        settings: of the run.
+
+    Returns:
+        The belief and the agent around it.
+    """
+    obs_dim, action_dim = task_dims(settings.env)
+    belief = build_belief(
+        settings.belief,
+        obs_dim=obs_dim,
+        action_dim=action_dim,
+        normalize=settings.loss.normalize,
+    )
+    return belief, Agent(belief, action_dim, settings.heads)
+
+
+def train_rollout(training: Training, settings: Settings) -> dict[str, Any]:
+    """Collect one rollout and learn from it.
+
+    Args:
+        training: changed in place.
+        settings: of the run.
+
+    Returns:
+        What there is to log, see :func:`metric_columns`; the times are left to the caller.
+    """
+    progress = training.progress
+    lr = settings.optim.lr * max(0.0, 1 - progress.frames / settings.total_frames)
+    data = training.collector.rollout()
+    add_advantages(data, training.agent, training.gae)
+    sequences = to_sequences(data, training.loss, settings.optim.sequence_length)
+    done = data.get(("next", "done"))
+    finished = data.get(("next", "episode_reward"))[done].tolist()
+    progress.frames += data.numel()
+    progress.episodes += len(finished)
+    progress.returns.extend(finished)
+    row = {
+        "frames": progress.frames,
+        "episodes": progress.episodes,
+        "return": _mean(progress.returns),
+        "missing_ratio": realised_missing_ratio(data),
+        "log_likelihood": log_likelihood_per_entry(data),
+        "explained_variance": explained_variance(data),
+        "action_std": data.get("scale").mean().item(),
+        "lr": lr,
+        **training.belief.summary(),
+    }
+    # The rollout's own log-likelihood, of data not yet learned from, goes before the update's.
+    return _update(training, sequences, settings.optim, lr) | row
+
+
+def _update(
+    training: Training, sequences: TensorDict, optim: OptimSettings, lr: float
+) -> dict[str, float]:
+    """Take the gradient steps of one rollout; return the means of what the loss reports."""
+    optimizer, loss = training.optimizer, training.loss
+    parameters = list(training.agent.parameters())
+    for group in optimizer.param_groups:
+        group["lr"] = lr
+    seen: dict[str, list[torch.Tensor]] = {}
+    for _ in range(optim.epochs):
+        for minibatch in minibatches(sequences, optim.minibatches, training.generator):
+            out = loss(minibatch)
+            terms = {key: value for key, value in out.items() if isinstance(value, torch.Tensor)}
+            total = sum(value for key, value in terms.items() if key.startswith("loss"))
+            assert isinstance(total, torch.Tensor)
+            optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            terms["grad_norm"] = torch.nn.utils.clip_grad_norm_(parameters, optim.max_grad_norm)
+            optimizer.step()
+            for key, value in terms.items():
+                seen.setdefault(key, []).append(value.detach())
+    means = {key: torch.stack([v.mean() for v in values]).mean() for key, values in seen.items()}
+    return {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
+
+
+_NAMES = {"kl_approx": "kl", "ESS": "ess"}
+
+_COLUMNS = (
+    "frames",
+    "episodes",
+    "return",
+    "missing_ratio",
+    "log_likelihood",
+    "loss_objective",
+    "loss_critic",
+    "loss_entropy",
+    "loss_model",
+    "kl",
+    "clip_fraction",
+    "ess",
+    "explained_variance",
+    "grad_norm",
+    "action_std",
+    "lr",
+)
+
+
+def metric_columns(training: Training) -> list[str]:
+    """Return the columns of metrics.csv.
+
+    Args:
+        training: whose belief may add its own.
+
+    Returns:
+        Their names, frames first, times last.
+    """
+    return [*_COLUMNS, *training.belief.summary(), "steps_per_second", "wall_time"]
+
+
+def _mean(values: deque[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def training_state(training: Training) -> dict[str, Any]:
+    """Return everything that a checkpoint holds.
+
+    Args:
+        training: between two rollouts.
+
+    Returns:
+        Tensors, numbers, texts, and containers of them.
+    """
+    progress = training.progress
+    return {
+        "agent": training.agent.state_dict(),
+        "optimizer": training.optimizer.state_dict(),
+        "transforms": training.env.state_dict(),
+        "simulators": training.env.base_env.state_dict(),
+        # Collector has no public way to its carry-over (the root step from which the next rollout
+        # goes on): its own state_dict leaves it out and starts new episodes.
+        "carrier": training.collector._carrier.to_dict(),
+        "torch_generator": torch.get_rng_state(),
+        "minibatch_generator": training.generator.get_state(),
+        "progress": {
+            "frames": progress.frames,
+            "episodes": progress.episodes,
+            "returns": list(progress.returns),
+            "train_seconds": progress.train_seconds,
+            "evaluated_frames": progress.evaluated_frames,
+        },
+    }
+
+
+def restore(training: Training, state: dict[str, Any], source: str) -> None:
+    """Put a run back to where a checkpoint was written.
+
+    Args:
+        training: freshly assembled from the same settings; changed in place.
+        state: from :func:`training_state`.
+        source: where it came from, for the error.
+
+    Raises:
+        UserError: if it belongs to another run: another task, another belief, other sizes.
+    """
+    try:
+        training.agent.load_state_dict(state["agent"])
+        training.optimizer.load_state_dict(state["optimizer"])
+        training.env.load_state_dict(state["transforms"])
+        training.env.base_env.load_state_dict(state["simulators"])
+        carrier = TensorDict.from_dict(state["carrier"], batch_size=training.env.batch_size)
+        training.collector._carrier = carrier
+        training.generator.set_state(state["minibatch_generator"])
+        kept = dict(state["progress"])
+        kept["returns"] = deque(kept["returns"], maxlen=_RECENT_EPISODES)
+        training.progress = Progress(**kept)
+        torch.set_rng_state(state["torch_generator"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(
+            f"`{source}` does not fit the settings of this run (another task, belief or size?): "
+            f"{reason[:300]}"
+        ) from error

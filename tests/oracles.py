@@ -1,0 +1,355 @@
+"""Slow float64 truths that the library is held to.
+
+Everything here is written from the definitions and shares no code with the package. A missing
+entry is missing in the plainest way: its row is deleted (`x[rows]`, `H[rows]`, `R[rows][:, rows]`)
+before any arithmetic. Batch and time are Python loops, linear systems go through
+`torch.linalg.solve` (LU, where the library uses Cholesky), and every gradient is what autograd
+makes of that. Nothing here is fast and nothing here is clever.
+
+Symbols: m, P are the mean and covariance of a belief, H, R, B, d the emission of eq. (3)
+x = H s + B a + d + noise, Q the transition covariance, rows the indices of the observed entries.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+Transition = Callable[[Tensor, Tensor], Tensor]
+
+
+# --- one step, one vector -----------------------------------------------------------------------
+
+
+def predict(
+    mean: Tensor,
+    cov: Tensor,
+    transition: Transition,
+    transition_cov: Tensor,
+    action: Tensor,
+    jacobian: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Eq. (8): m = f(m, a), P = Q; or P = J P J' + Q where a Jacobian is given."""
+    if jacobian is None:
+        return transition(mean, action), transition_cov
+    return transition(mean, action), jacobian @ cov @ jacobian.T + transition_cov
+
+
+def _observed_rows(
+    observation: Tensor,
+    observed: Tensor,
+    matrix: Tensor,
+    noise: Tensor,
+    offset: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    rows = observed.nonzero().squeeze(-1)
+    x = observation[rows]
+    if offset is not None:
+        x = x - offset[rows]
+    return x, matrix[rows], noise[rows][:, rows]
+
+
+def update(
+    mean: Tensor,
+    cov: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    matrix: Tensor,
+    noise: Tensor,
+    offset: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Eq. (10) on the observed rows alone."""
+    x, h, r = _observed_rows(observation, observed, matrix, noise, offset)
+    if x.numel() == 0:
+        return mean, cov
+    s = h @ cov @ h.T + r
+    gain = torch.linalg.solve(s, h @ cov.T).T
+    return mean + gain @ (x - h @ mean), cov - gain @ h @ cov
+
+
+def log_likelihood(
+    mean: Tensor,
+    cov: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    matrix: Tensor,
+    noise: Tensor,
+    offset: Tensor | None = None,
+) -> Tensor:
+    """Eq. (12): the log density of the observed entries under the predicted belief."""
+    x, h, r = _observed_rows(observation, observed, matrix, noise, offset)
+    if x.numel() == 0:
+        return mean.new_zeros(())
+    residual = x - h @ mean
+    s = h @ cov @ h.T + r
+    mahalanobis = residual @ torch.linalg.solve(s, residual)
+    return -0.5 * (mahalanobis + torch.logdet(s) + x.numel() * math.log(2 * math.pi))
+
+
+# --- a batch of sequences -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Filtered means (b, t, s), filtered covariances (b, t, s, s), log-likelihoods (b, t)."""
+
+    mean: Tensor
+    cov: Tensor
+    log_likelihood: Tensor
+
+
+def filter_sequence(
+    *,
+    observation: Tensor,
+    observed: Tensor,
+    previous_action: Tensor,
+    reset: Tensor,
+    start_mean: Tensor,
+    start_cov: Tensor | None = None,
+    initial_mean: Tensor,
+    initial_cov: Tensor,
+    transition: Transition,
+    transition_cov: Tensor | Transition,
+    matrix: Tensor,
+    noise: Tensor,
+    action_matrix: Tensor | None = None,
+    bias: Tensor | None = None,
+    jacobian: Tensor | None = None,
+    restart: Tensor | None = None,
+    restart_mean: Tensor | None = None,
+) -> Sequence:
+    """Filter [batch, time] data one row and one step at a time.
+
+    `start_mean` (b, s) is the filtered belief of the step before the first one. At a step with
+    `reset` (b, t) the predicted belief is the initial one. At a step with `restart` (b, t) the
+    belief before the step is not the one just computed but the stored `restart_mean` (b, t, s).
+    Where both hold, the reset wins. `transition_cov` is a matrix or a function of (mean, action).
+    """
+    batch, time = observed.shape[:2]
+    means, covs, lls = [], [], []
+    for b in range(batch):
+        mean = start_mean[b]
+        cov = initial_cov if start_cov is None else start_cov[b]
+        for t in range(time):
+            action = previous_action[b, t]
+            if restart is not None and restart_mean is not None and restart[b, t]:
+                mean = restart_mean[b, t]
+            if reset[b, t]:
+                mean, cov = initial_mean, initial_cov
+            else:
+                q = transition_cov(mean, action) if callable(transition_cov) else transition_cov
+                mean, cov = predict(mean, cov, transition, q, action, jacobian)
+            offset = None
+            if action_matrix is not None or bias is not None:
+                offset = torch.zeros_like(observation[b, t])
+                if action_matrix is not None:
+                    offset = offset + action_matrix @ action
+                if bias is not None:
+                    offset = offset + bias
+            step = (observation[b, t], observed[b, t], matrix, noise, offset)
+            lls.append(log_likelihood(mean, cov, *step))
+            mean, cov = update(mean, cov, *step)
+            means.append(mean)
+            covs.append(cov)
+    return Sequence(
+        torch.stack(means).unflatten(0, (batch, time)),
+        torch.stack(covs).unflatten(0, (batch, time)),
+        torch.stack(lls).unflatten(0, (batch, time)),
+    )
+
+
+def mean_network(
+    weights: list[Tensor],
+    biases: list[Tensor],
+    residual: bool,
+    activation: str,
+) -> Transition:
+    """Eq. (8) as a plain function: layers of W z + b with relu or tanh between them."""
+
+    def transition(mean: Tensor, action: Tensor) -> Tensor:
+        z = torch.cat([mean, action], -1)
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            if i > 0:
+                z = {"relu": torch.relu, "tanh": torch.tanh}[activation](z)
+            z = (weight @ z.unsqueeze(-1)).squeeze(-1) + bias
+        return mean + z if residual else z
+
+    return transition
+
+
+# --- scenarios: linear systems, some with answers known in closed form --------------------------
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """s' = A s + C a + q, q ~ N(0, Q);  x = H s + B a + d + e, e ~ N(0, R)."""
+
+    dynamics: Tensor  # A, shape: (s, s)
+    control: Tensor  # C, shape: (s, a)
+    transition_cov: Tensor  # Q, shape: (s, s)
+    matrix: Tensor  # H, shape: (n, s)
+    action_matrix: Tensor  # B, shape: (n, a)
+    bias: Tensor  # d, shape: (n,)
+    noise: Tensor  # R, shape: (n, n)
+    initial_mean: Tensor  # shape: (s,)
+    initial_cov: Tensor  # shape: (s, s)
+
+    @property
+    def state_dim(self) -> int:
+        return self.matrix.shape[1]
+
+    @property
+    def obs_dim(self) -> int:
+        return self.matrix.shape[0]
+
+    @property
+    def action_dim(self) -> int:
+        return self.control.shape[1]
+
+    def transition(self, mean: Tensor, action: Tensor) -> Tensor:
+        return mean @ self.dynamics.T + action @ self.control.T
+
+    def offset(self, action: Tensor) -> Tensor:
+        return action @ self.action_matrix.T + self.bias
+
+    def to(self, dtype: torch.dtype) -> LinearSystem:
+        return replace(self, **{k: v.to(dtype) for k, v in vars(self).items()})
+
+
+def spd(dim: int, generator: torch.Generator, scale: float = 1.0) -> Tensor:
+    """A well-conditioned random covariance of standard deviation about `scale`."""
+    a = torch.randn(dim, dim, generator=generator, dtype=torch.float64)
+    cov = scale**2 * (a @ a.T / dim + 0.3 * torch.eye(dim, dtype=torch.float64))
+    return (cov + cov.T) / 2
+
+
+def random_system(
+    state: int,
+    obs: int,
+    action: int = 2,
+    *,
+    seed: int = 0,
+    full_noise: bool = False,
+) -> LinearSystem:
+    """A random stable system with an initial covariance that has nothing to do with Q."""
+    g = torch.Generator().manual_seed(seed)
+
+    def randn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    diagonal = (0.2 + 0.5 * torch.rand(obs, generator=g, dtype=torch.float64)) ** 2
+    return LinearSystem(
+        dynamics=0.9 * torch.linalg.qr(randn(state, state))[0],
+        control=0.3 * randn(state, action),
+        transition_cov=spd(state, g, 0.5),
+        matrix=randn(obs, state) / math.sqrt(state),
+        action_matrix=0.3 * randn(obs, action),
+        bias=0.3 * randn(obs),
+        noise=spd(obs, g, 0.4) if full_noise else torch.diag(diagonal),
+        initial_mean=randn(state),
+        initial_cov=spd(state, g, 1.5),
+    )
+
+
+@dataclass(frozen=True)
+class Data:
+    """What a filter is given: (b, t, n) observations with 0 where missing, and the rest."""
+
+    observation: Tensor
+    observed: Tensor
+    previous_action: Tensor
+    reset: Tensor
+    start_mean: Tensor
+
+
+def simulate(
+    system: LinearSystem,
+    batch: int,
+    time: int,
+    *,
+    seed: int = 0,
+    missing_rate: float = 0.4,
+    reset_rate: float = 0.0,
+) -> Data:
+    """Draw data from the system with independent dropouts and, if asked, resets inside rows.
+
+    Where it fits, one frame holds nothing, one holds a single entry and one holds everything.
+    """
+    g = torch.Generator().manual_seed(1000 + seed)
+
+    def randn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    n, s = system.obs_dim, system.state_dim
+    root_q = torch.linalg.cholesky(system.transition_cov)
+    root_r = torch.linalg.cholesky(system.noise)
+    root_p = torch.linalg.cholesky(system.initial_cov)
+    start_mean = randn(batch, s)
+    action = randn(batch, time, system.action_dim)
+    reset = torch.rand(batch, time, generator=g) < reset_rate
+    observed = torch.rand(batch, time, n, generator=g) >= missing_rate
+    if time >= 3:
+        observed[0, 0] = False
+        observed[0, 1] = False
+        observed[0, 1, n // 2] = True
+        observed[0, 2] = True
+    action = torch.where(reset.unsqueeze(-1), torch.zeros_like(action), action)
+    state, frames = start_mean, []
+    for t in range(time):
+        fresh = system.initial_mean + randn(batch, s) @ root_p.T
+        moved = system.transition(state, action[:, t]) + randn(batch, s) @ root_q.T
+        state = torch.where(reset[:, t, None], fresh, moved)
+        frames.append(
+            state @ system.matrix.T + system.offset(action[:, t]) + randn(batch, n) @ root_r.T
+        )
+    observation = torch.stack(frames, 1)
+    observation = torch.where(observed, observation, torch.zeros_like(observation))
+    return Data(observation, observed, action, reset, start_mean)
+
+
+def joint_log_likelihood(system: LinearSystem, data: Data, row: int) -> Tensor:
+    """log density of all observed entries of one row under ONE joint Gaussian.
+
+    The row starts from the initial belief at its first step. Every state is written as a linear
+    map of the first state and the process noises, so the stacked observations are one Gaussian
+    vector; its missing entries are deleted. No filter is involved.
+    """
+    time, n, s = data.observed.shape[1], system.obs_dim, system.state_dim
+    source_cov = torch.block_diag(
+        system.initial_cov, *[system.transition_cov for _ in range(time - 1)]
+    )
+    rows_of_map, means = [], []
+    state_map = torch.zeros(s, s * time, dtype=torch.float64)
+    state_map[:, :s] = torch.eye(s, dtype=torch.float64)
+    mean = system.initial_mean
+    for t in range(time):
+        action = data.previous_action[row, t]
+        if t > 0:
+            state_map = system.dynamics @ state_map
+            state_map[:, s * t : s * (t + 1)] += torch.eye(s, dtype=torch.float64)
+            mean = system.transition(mean, action)
+        rows_of_map.append(system.matrix @ state_map)
+        means.append(system.matrix @ mean + system.offset(action))
+    stacked = torch.cat(rows_of_map)
+    cov = stacked @ source_cov @ stacked.T + torch.block_diag(*[system.noise] * time)
+    keep = data.observed[row].reshape(time * n).nonzero().squeeze(-1)
+    x = data.observation[row].reshape(-1)[keep]
+    return torch.distributions.MultivariateNormal(
+        torch.cat(means)[keep], cov[keep][:, keep]
+    ).log_prob(x)
+
+
+# Scalar random walk, A = H = Q = R = 1, covariance propagated. The predicted variance obeys
+# P = P - P^2 / (P + 1) + 1, that is P^2 - P - 1 = 0: it settles on the golden ratio, and the
+# filtered variance on P - 1.
+GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
+
+
+def scalar_random_walk() -> LinearSystem:
+    one = torch.ones(1, 1, dtype=torch.float64)
+    zero = torch.zeros(1, dtype=torch.float64)
+    return LinearSystem(one, 0 * one, one, one, 0 * one, zero, one, zero, one)

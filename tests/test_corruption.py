@@ -1,0 +1,219 @@
+"""What `functional/corruption.py` promises: the laws of missingness and noise.
+
+MCAR: every entry missing with probability eta. MAR and NMAR: P(missing_i) = min(sigmoid(b1_i . a +
+b2_i . x + b0_i), eta), x being the always observed entries (MAR) or all (NMAR); 0 for the always
+observed ones. The oracle is that sentence as a loop over entries. Realised ratios lie within a few
+standard errors, sqrt(p (1 - p) / n), of the law. Randomness comes from the generator passed in
+alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchrl_drbpn.functional.corruption import (
+    count_always_observed,
+    draw_mechanism,
+    missing_probability,
+    sample_noise,
+    sample_observed,
+)
+
+OBS, ACTION = 9, 3
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def mechanism(kind, seed=0, **kwargs):
+    return draw_mechanism(kind, OBS, ACTION, generator=seeded(seed), **kwargs)
+
+
+def example(batch=(4,), seed=5):
+    generator = seeded(seed)
+    x = torch.randn(*batch, OBS, generator=generator, dtype=torch.float64)
+    return x, torch.randn(*batch, ACTION, generator=generator, dtype=torch.float64)
+
+
+# -------------------------------------------------------------------------------- the mechanism
+@pytest.mark.parametrize(
+    ("obs", "share", "count"),
+    [(17, 0.25, 4), (11, 0.25, 3), (27, 0.25, 7), (1, 0.25, 1), (4, 0.0, 1), (4, 1.0, 4)],
+)
+def test_the_number_of_always_observed_entries_is_the_rounded_share_and_at_least_one(
+    obs, share, count
+):
+    assert count_always_observed(obs, share) == count
+    drawn = draw_mechanism("mar", obs, ACTION, always_observed=share, generator=seeded())
+    assert int(drawn.always_observed.sum()) == count
+
+
+def test_mar_and_nmar_share_their_numbers():
+    mar, nmar = mechanism("mar"), mechanism("nmar")
+    assert torch.equal(mar.always_observed, nmar.always_observed)
+    assert torch.equal(mar.bias, nmar.bias)
+    assert torch.equal(mar.action_weight, nmar.action_weight)
+    always = mar.always_observed
+    assert torch.equal(mar.observation_weight[:, always], nmar.observation_weight[:, always])
+    assert (mar.observation_weight[:, ~always] == 0).all()
+    assert (nmar.observation_weight[:, ~always] != 0).all()
+
+
+def test_a_mechanism_depends_on_its_generator_alone_and_the_action_comes_last():
+    assert all(map(torch.equal, mechanism("mar", 3), mechanism("mar", 3)))
+    assert not torch.equal(mechanism("mar", 3).action_weight, mechanism("mar", 4).action_weight)
+    without = draw_mechanism("mar", OBS, 0, generator=seeded(3))
+    assert all(map(torch.equal, mechanism("mar", 3)[:3], without[:3]))
+
+
+def test_weights_are_standard_normal():
+    drawn = draw_mechanism("nmar", 120, 40, generator=seeded())
+    for part in (drawn.bias[~drawn.always_observed], drawn.observation_weight, drawn.action_weight):
+        n = part.numel()
+        assert abs(part.mean()) < 3.5 / math.sqrt(n)
+        assert abs(part.var() - 1) < 3.5 * math.sqrt(2 / n)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, math.nan])
+def test_a_share_outside_the_unit_interval_is_refused(share):
+    with pytest.raises(ValueError, match=r"`always_observed` must be a share in \[0, 1\]"):
+        mechanism("mar", always_observed=share)
+
+
+def test_mcar_has_no_mechanism_to_draw():
+    with pytest.raises(ValueError, match='`kind` must be "mar" or "nmar"'):
+        mechanism("mcar")
+
+
+# ------------------------------------------------------------------------------ the probabilities
+@pytest.mark.parametrize("kind", ["mar", "nmar"])
+@pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
+def test_probabilities_are_the_formula_entry_by_entry(kind, eta):
+    drawn = mechanism(kind)
+    x, action = example((2, 3))
+    probability = missing_probability(drawn, x, action, eta)
+    assert probability.shape == x.shape
+    for row in range(2):
+        for column in range(3):
+            for i in range(OBS):
+                if drawn.always_observed[i]:
+                    expected = 0.0
+                else:
+                    logit = float(drawn.bias[i])
+                    for j in range(ACTION):
+                        logit += float(drawn.action_weight[i, j] * action[row, column, j])
+                    for j in range(OBS):
+                        if kind == "nmar" or drawn.always_observed[j]:
+                            logit += float(drawn.observation_weight[i, j] * x[row, column, j])
+                    expected = min(1 / (1 + math.exp(-logit)), eta)
+                assert float(probability[row, column, i]) == pytest.approx(expected, abs=1e-12)
+
+
+def test_no_previous_action_is_the_zero_action():
+    x, action = example()
+    drawn = mechanism("nmar")
+    none = missing_probability(drawn, x, None, 0.9)
+    assert torch.equal(none, missing_probability(drawn, x, torch.zeros_like(action), 0.9))
+    assert not torch.equal(none, missing_probability(drawn, x, action, 0.9))
+
+
+@pytest.mark.parametrize(("kind", "depends"), [("mar", False), ("nmar", True)])
+def test_only_nmar_depends_on_entries_that_may_be_missing(kind, depends):
+    x, action = example()
+    drawn = mechanism(kind)
+    moved = x.clone()
+    moved[:, ~drawn.always_observed] += 1.0
+    before = missing_probability(drawn, x, action, 1.0)
+    after = missing_probability(drawn, moved, action, 1.0)
+    assert torch.equal(before, after) is not depends
+
+
+# -------------------------------------------------------------------------------------- the masks
+@pytest.mark.parametrize("eta", [0.05, 0.3, 0.9])
+def test_the_realised_ratio_of_mcar_is_eta(eta):
+    x = torch.zeros(2000, OBS)
+    missing = 1 - sample_observed(eta, x, seeded(1)).double()
+    error = math.sqrt(eta * (1 - eta) / x.numel())
+    assert abs(missing.mean() - eta) < 3 * error
+    # every component, the first as much as the last
+    assert ((missing.mean(0) - eta).abs() < 4 * error * math.sqrt(OBS)).all()
+
+
+@pytest.mark.parametrize("kind", ["mar", "nmar"])
+def test_realised_ratios_follow_the_probabilities(kind):
+    x, action = example((1,))
+    probability = missing_probability(mechanism(kind), x, action, 0.5)
+    draws = sample_observed(probability.expand(20_000, OBS), x.expand(20_000, OBS), seeded(2))
+    realised = 1 - draws.double().mean(0)
+    error = (probability[0] * (1 - probability[0]) / 20_000).sqrt()
+    assert ((realised - probability[0]).abs() <= 4 * error).all()
+
+
+def test_entries_go_missing_independently():
+    missing = 1 - sample_observed(0.4, torch.zeros(20_000, 4), seeded(3)).double()
+    correlation = torch.corrcoef(missing.T) - torch.eye(4)
+    assert correlation.abs().max() < 4 / math.sqrt(20_000)
+
+
+@pytest.mark.parametrize("kind", ["mar", "nmar"])
+def test_always_observed_entries_never_go_missing(kind):
+    drawn = mechanism(kind)
+    x, action = example((5000,))
+    observed = sample_observed(missing_probability(drawn, x, action, 1.0), x, seeded(4))
+    assert observed[:, drawn.always_observed].all()
+    assert not observed[:, ~drawn.always_observed].all(0).any()
+
+
+def test_eta_zero_loses_nothing_and_eta_one_everything():
+    x = torch.zeros(500, OBS)
+    assert sample_observed(0.0, x, seeded()).all()
+    assert not sample_observed(1.0, x, seeded()).any()
+
+
+def test_a_mask_depends_on_the_generator_and_not_on_the_dtype():
+    x = torch.zeros(50, OBS)
+    first = sample_observed(0.5, x, seeded(6))
+    assert torch.equal(first, sample_observed(0.5, x.double(), seeded(6)))
+    assert not torch.equal(first, sample_observed(0.5, x, seeded(7)))
+
+
+def test_a_nan_is_not_hidden_by_the_mask_that_it_would_upset():
+    x, action = example()
+    x[0, 0] = math.nan
+    observed = sample_observed(missing_probability(mechanism("nmar"), x, action, 0.5), x, seeded())
+    assert observed[0].all()
+
+
+# ---------------------------------------------------------------------------------------- noise
+def test_noise_has_mean_zero_and_the_given_standard_deviation():
+    std = torch.tensor([0.0, 0.1, 3.0], dtype=torch.float64)
+    noise = sample_noise(std, torch.zeros(40_000, 3, dtype=torch.float64), seeded(8))
+    assert noise.dtype == torch.float64
+    assert (noise[:, 0] == 0).all()
+    assert (noise.mean(0).abs() <= 4 * std / math.sqrt(40_000)).all()
+    assert ((noise.std(0) - std).abs() <= 4 * std / math.sqrt(2 * 40_000)).all()
+
+
+def test_one_number_is_the_same_number_for_every_component():
+    like = torch.zeros(5, 3)
+    one = sample_noise(0.2, like, seeded(9))
+    assert torch.equal(one, sample_noise(torch.full((3,), 0.2), like, seeded(9)))
+
+
+def test_the_global_generator_is_neither_read_nor_advanced():
+    x, action = example()
+    results = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        state = torch.get_rng_state()
+        drawn, generator = mechanism("nmar"), seeded()
+        probability = missing_probability(drawn, x, action, 0.5)
+        results.append(
+            (sample_observed(probability, x, generator), sample_noise(1.0, x, generator))
+        )
+        assert torch.equal(torch.get_rng_state(), state)
+    assert all(map(torch.equal, *results))

@@ -1,0 +1,187 @@
+"""FillLastObserved: a missing entry takes the last value of its component observed in this episode.
+
+Specified here, against a loop that fills step by step: values in any arrangement of environments with
+partial resets; `fill_value` before the first observed value; the mask and the raw observation stay where
+they are; what lies under a False mask is never read; the order rule. On top, the duties of every
+transform.
+"""
+
+import pytest
+import torch
+from contracts import StaircaseEnv, TransformContract, gym_env
+from tensordict import TensorDict
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
+
+from torchrl_drbpn.transforms import FillLastObserved, ObservationMissingness, SensorReduction
+
+
+def masked(env, eta=0.5, seed=0):
+    """Append missingness that keeps the complete observation beside what is left of it."""
+    return env.append_transform(
+        ObservationMissingness("mcar", eta, seed=seed, complete_key="complete_observation")
+    )
+
+
+class TestFillLastObservedContract(TransformContract):
+    def make_transform(self):
+        return FillLastObserved()
+
+    def make_env(self):
+        return masked(gym_env())
+
+    def make_batched_env(self):
+        return masked(super().make_batched_env())
+
+    def make_data(self, batch, dtype=torch.float32):
+        data = super().make_data(batch, dtype)
+        observed = torch.rand(data["observation"].shape, generator=torch.Generator().manual_seed(3))
+        data["observed"] = observed < 0.5
+        data["observation"] = data["observation"] * data["observed"]
+        return data
+
+    def check_output(self, before, after):
+        filled, observed = after["observation"], after["observed"]
+        assert torch.equal(filled, after["last_observation"])
+        if "observation" in before.keys():
+            assert torch.equal(filled[observed], before["observation"][observed])
+        if "complete_observation" in after.keys():
+            assert torch.equal(filled[observed], after["complete_observation"][observed])
+
+
+def filled_by_hand(data, fill_value):
+    """Fill the last values row by row and step by step, from the complete observations."""
+    rows, steps, obs = data["complete_observation"].shape
+    filled = torch.empty(rows, steps, obs)
+    last = torch.full((rows, obs), fill_value)
+    for t in range(steps):
+        for b in range(rows):
+            if t == 0 or data["next", "done"][b, t - 1]:
+                last[b] = fill_value
+            for i in range(obs):
+                if data["observed"][b, t, i]:
+                    last[b, i] = data["complete_observation"][b, t, i]
+        filled[:, t] = last
+    return filled
+
+
+@pytest.mark.parametrize("fill_value", [0.0, -7.0])
+@pytest.mark.parametrize("where", ["inside", "outside", "batched"])
+def test_it_equals_filling_step_by_step(where, fill_value):
+    def simulator():
+        return TransformedEnv(StaircaseEnv(horizon=4), Compose())
+
+    def filler():
+        return FillLastObserved(fill_value=fill_value)
+
+    if where == "batched":
+        env = masked(simulator()).append_transform(filler())
+    elif where == "inside":
+        env = SerialEnv(2, lambda: masked(simulator()).append_transform(filler()))
+    else:
+        env = masked(TransformedEnv(SerialEnv(2, simulator), Compose())).append_transform(filler())
+    data = env.rollout(17, break_when_any_done=False)
+    assert data["next", "done"].sum() > 6
+    assert (data["observed"].float().mean() - 0.5).abs() < 0.2
+    data = data.reshape(-1, 17)
+    assert torch.equal(data["observation"], filled_by_hand(data, fill_value))
+
+
+def test_a_collector_carries_the_last_values_from_batch_to_batch():
+    from torchrl.collectors import Collector
+
+    env = masked(TransformedEnv(StaircaseEnv(horizon=5), Compose()))
+    env = env.append_transform(FillLastObserved())
+    collector = Collector(env, frames_per_batch=12, total_frames=48)
+    data = torch.cat(list(collector), -1)
+    assert data.shape == (3, 16)
+    assert torch.equal(data["observation"], filled_by_hand(data, 0.0))
+
+
+def test_the_mask_stays_as_it_is():
+    plain = masked(TransformedEnv(StaircaseEnv(), Compose()), seed=5)
+    filled = masked(TransformedEnv(StaircaseEnv(), Compose()), seed=5)
+    filled = filled.append_transform(FillLastObserved())
+    torch.manual_seed(0)
+    expected = plain.rollout(6, break_when_any_done=False)
+    received = filled.rollout(6, break_when_any_done=False)
+    assert torch.equal(received["observed"], expected["observed"])
+    assert not received["observed"].all()
+
+
+def test_a_component_that_never_arrives_keeps_the_fill_value():
+    env = TransformedEnv(
+        StaircaseEnv(), Compose(SensorReduction([1]), FillLastObserved(fill_value=2.5))
+    )
+    data = env.rollout(6, break_when_any_done=False)
+    assert (data["observation"][..., 1] == 2.5).all()
+    assert torch.equal(data["observation"][0, 0, [0, 2]], torch.tensor([0.0, 0.2]))
+
+
+@pytest.mark.parametrize("junk", [float("nan"), float("inf"), 1e30])
+def test_what_lies_under_a_false_mask_is_never_read(junk):
+    root = TensorDict(last_observation=torch.tensor([1.0, 2.0]))
+    step = TensorDict(
+        observation=torch.tensor([5.0, junk]), observed=torch.tensor([True, False])
+    )
+    after = FillLastObserved()._step(root, step)
+    assert torch.equal(after["observation"], torch.tensor([5.0, 2.0]))
+
+
+def test_with_other_out_keys_the_observation_stays_as_it_was():
+    env = masked(TransformedEnv(StaircaseEnv(), Compose()))
+    env = env.append_transform(FillLastObserved(out_keys="filled", state_keys="memory"))
+    data = env.rollout(8, break_when_any_done=False)
+    assert (data["observation"][~data["observed"]] == 0).all()
+    assert torch.equal(data["filled"], filled_by_hand(data, 0.0))
+    assert torch.equal(data["memory"], data["filled"])
+
+
+def test_several_observations_have_last_values_of_their_own():
+    fill = FillLastObserved(["joints", ("arm", "touch")], ["joints_seen", ("arm", "seen")])
+    seen = torch.tensor([True, False])
+    root = TensorDict(
+        {
+            "last_joints": torch.tensor([1.0, 2.0]),
+            ("arm", "last_touch"): torch.tensor([3.0, 4.0]),
+        }
+    )
+    step = TensorDict(
+        {
+            "joints": torch.tensor([8.0, 0.0]),
+            "joints_seen": seen,
+            ("arm", "touch"): torch.tensor([0.0, 9.0]),
+            ("arm", "seen"): ~seen,
+        }
+    )
+    after = fill._step(root, step)
+    assert torch.equal(after["joints"], torch.tensor([8.0, 2.0]))
+    assert torch.equal(after["arm", "touch"], torch.tensor([3.0, 9.0]))
+
+
+def test_before_missingness_is_refused():
+    with pytest.raises(ValueError, match="`FillLastObserved` stands before"):
+        TransformedEnv(
+            StaircaseEnv(),
+            Compose(
+                SensorReduction([0]), FillLastObserved(), ObservationMissingness("mcar", 0.5)
+            ),
+        )
+
+
+def test_without_a_mask_it_says_who_writes_one():
+    env = TransformedEnv(StaircaseEnv(), FillLastObserved())
+    for use in (env.reset, lambda: env.observation_spec):
+        with pytest.raises(KeyError, match="reads the mask 'observed'.*ObservationMissingness"):
+            use()
+
+
+@pytest.mark.parametrize("bad", [torch.ones(2), torch.ones(1, dtype=torch.bool)])
+def test_a_mask_of_wrong_dtype_or_shape_is_refused(bad):
+    step = TensorDict(observation=torch.zeros(2), observed=bad)
+    with pytest.raises(ValueError, match="`observed` must be bool of shape"):
+        FillLastObserved()._step(TensorDict(), step)
+
+
+def test_keys_must_come_in_pairs():
+    with pytest.raises(ValueError, match="`out_keys` must name one key for each"):
+        FillLastObserved("a", out_keys=["b", "c"])

@@ -1,0 +1,143 @@
+"""PreviousAction: `previous_action` at step t + 1 is the action chosen at step t, zero after a reset.
+
+Specified here: the shift by one step with partial resets; that it is the action as the agent chose it,
+not as an action transform earlier in the chain or the environment changed it; that discrete actions
+keep dtype and shape; that nothing private leaks into the data. On top, the duties of every transform.
+"""
+
+import pytest
+import torch
+from contracts import StaircaseEnv, TransformContract
+from torchrl.data import Bounded, Composite
+from torchrl.envs import ActionScaling, Compose, GymEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_drbpn.transforms import PreviousAction
+
+
+class TestPreviousActionContract(TransformContract):
+    keeps_float64 = ("previous_action",)
+
+    def make_transform(self):
+        return PreviousAction()
+
+    def make_data(self, batch, dtype=torch.float32):
+        data = super().make_data(batch, dtype)
+        return data.set("action", torch.zeros(*batch, 2, dtype=dtype))
+
+    def check_output(self, before, after):
+        previous = after["previous_action"]
+        assert previous.shape[:-1] == after.batch_size
+        assert previous.dtype.is_floating_point
+        assert previous.isfinite().all()
+
+    def test_an_absent_observation_is_named(self):
+        # what it reads is the action of the root
+        root = self.make_root((3,)).exclude("action")
+        with pytest.raises(KeyError, match="PreviousAction.*action"):
+            self.make_transform()._step(root, self.make_data((3,)))
+
+
+def expected_shift(data):
+    """Actions moved by one step along the last batch dimension, zero where an episode begins."""
+    shifted = torch.zeros_like(data["action"])
+    going_on = ~data["next", "done"][..., :-1, :]
+    shifted[..., 1:, :] = data["action"][..., :-1, :] * going_on
+    return shifted
+
+
+@pytest.mark.parametrize("where", ["inside", "outside", "batched"])
+def test_it_is_the_action_of_the_step_before_and_zero_after_every_reset(where):
+    def simulator():
+        return TransformedEnv(StaircaseEnv(horizon=2), Compose())
+
+    if where == "batched":
+        env = simulator().append_transform(PreviousAction())
+    elif where == "inside":
+        env = SerialEnv(2, lambda: simulator().append_transform(PreviousAction()))
+    else:
+        env = TransformedEnv(SerialEnv(2, simulator), PreviousAction())
+    data = env.rollout(11, break_when_any_done=False)
+    done = data["next", "done"]
+    assert done.any(-2).all()
+    assert not torch.equal(done, done[..., :1, :, :].expand_as(done))
+    assert torch.equal(data["previous_action"], expected_shift(data))
+    assert torch.equal(data["next", "previous_action"], data["action"])
+
+
+class DoublingEnv(StaircaseEnv):
+    """Accepts actions in [-1, 1] and overwrites what it was given, as an environment may that clips."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_spec = Composite(
+            action=Bounded(-1.0, 1.0, shape=(3, 2), dtype=torch.float32), shape=(3,)
+        )
+
+    def _step(self, tensordict):
+        self.received = tensordict["action"].clone()
+        return super()._step(tensordict)
+
+
+class Halve(Transform):
+    """An action transform: the environment receives half of what the agent chose."""
+
+    def __init__(self):
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+
+    def _inv_apply_transform(self, action):
+        return action / 2
+
+
+def test_it_is_the_chosen_action_not_the_one_that_the_simulator_received():
+    env = TransformedEnv(DoublingEnv(), Compose(Halve(), PreviousAction()))
+    data = env.rand_step(env.reset())
+    assert torch.equal(env.base_env.received, data["action"] / 2)
+    assert torch.equal(data["next", "previous_action"], data["action"])
+
+
+def test_action_transforms_later_in_the_chain_have_been_at_it():
+    env = TransformedEnv(DoublingEnv(), Compose(PreviousAction(), Halve()))
+    data = env.rand_step(env.reset())
+    assert torch.equal(data["next", "previous_action"], data["action"] / 2)
+
+
+def test_an_action_rescaled_by_torchrl_is_recorded_in_the_units_of_the_agent():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ActionScaling(), PreviousAction()))
+    data = env.rand_step(env.reset())
+    assert torch.equal(data["next", "previous_action"], data["action"])
+
+
+@pytest.mark.parametrize("categorical", [False, True])
+def test_a_discrete_action_keeps_dtype_and_shape(categorical):
+    env = TransformedEnv(
+        GymEnv("CartPole-v1", categorical_action_encoding=categorical), PreviousAction()
+    )
+    check_env_specs(env)
+    data = env.rollout(5)
+    assert data["previous_action"].dtype == data["action"].dtype
+    assert torch.equal(data["previous_action"][1:], data["action"][:-1])
+    assert (data["previous_action"][0] == 0).all()
+
+
+def test_nothing_private_is_left_in_the_data():
+    env = TransformedEnv(StaircaseEnv(), PreviousAction())
+    keys = {str(key) for key in env.rollout(3).keys(True, True)}
+    assert not [key for key in keys if "_chosen" in key]
+
+
+def test_other_keys_can_be_named():
+    env = TransformedEnv(StaircaseEnv(), PreviousAction(out_keys="last_action"))
+    data = env.rollout(3)
+    assert torch.equal(data["next", "last_action"], data["action"])
+
+
+def test_an_absent_action_is_named():
+    env = TransformedEnv(StaircaseEnv(), PreviousAction("torque"))
+    with pytest.raises(KeyError, match="PreviousAction.*torque"):
+        env.reset()
+
+
+def test_keys_must_come_in_pairs():
+    with pytest.raises(ValueError, match="`out_keys` must name one key"):
+        PreviousAction("action", ["a", "b"])

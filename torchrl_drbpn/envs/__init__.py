@@ -1,0 +1,5 @@
+"""Many simulators as one TorchRL environment."""
+
+from torchrl_drbpn.envs.gymnasium_batch import GymnasiumBatchEnv
+
+__all__ = ["GymnasiumBatchEnv"]

@@ -1,0 +1,253 @@
+"""Running statistics that a transform owns: shared by the observation and the return scaling."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any, Self, cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_drbpn.functional.statistics import Moments, masked_moments, merge_moments, variance
+from torchrl_drbpn.transforms._common import OrderedTransform
+
+__all__ = ["RunningMoments", "RunningScaleTransform", "flagged_rows", "spread_rows"]
+
+
+def flagged_rows(tensordict: TensorDictBase, name: str, key: NestedKey) -> Tensor | None:
+    """Return the rows that a flag such as `"_reset"` marks for the entry `key`.
+
+    Args:
+        tensordict: where the flag is looked for, beside `key` first, then in the folders above it.
+        name: `"_reset"` or `"_step"`.
+        key: the entry that is about to be written.
+
+    Returns:
+        A bool tensor of the batch shape, or None where there is no flag: every row is meant.
+    """
+    folders = key[:-1] if isinstance(key, tuple) else ()
+    for depth in range(len(folders), -1, -1):
+        flag_key = (*folders[:depth], name) if depth else name
+        flag = tensordict.get(flag_key, None)
+        if flag is not None:
+            batch_dims = tensordict.ndim
+            if flag.ndim > batch_dims:
+                flag = flag.flatten(batch_dims).any(-1)
+            return cast(Tensor, flag)
+    return None
+
+
+def spread_rows(rows: Tensor, value: Tensor) -> Tensor:
+    """Expand row flags of shape `(*batch,)` over a value of shape `(*batch, *event)`."""
+    return rows.reshape(*rows.shape, *(1,) * (value.ndim - rows.ndim)).expand_as(value)
+
+
+class RunningMoments(nn.Module):
+    """Keep count, mean and squared deviations per component, and the scale they give.
+
+    The buffers have shape `(0,)` until the first use or the first loaded state fixes the shape.
+    They are replaced, not written in place, so that a state_dict taken earlier stays what it was.
+
+    Args:
+        eps: added to the variance before its root is taken, squared units.
+    """
+
+    count: Tensor
+    mean: Tensor
+    m2: Tensor
+    inverse_scale: Tensor
+
+    def __init__(self, eps: float) -> None:
+        super().__init__()
+        self.eps = eps
+        for name in ("count", "mean", "m2"):
+            self.register_buffer(name, torch.zeros(0, dtype=torch.float64))
+        # Derived, hence not saved: what the hot path multiplies with.
+        self.register_buffer("inverse_scale", torch.zeros(0, dtype=torch.float64), persistent=False)
+
+    def initialise(self, event_shape: torch.Size, device: torch.device | None = None) -> None:
+        """Fix the shape, with nothing seen; do nothing where it is fixed already.
+
+        Args:
+            event_shape: shape of one sample.
+            device: where the statistics live.
+
+        Raises:
+            ValueError: statistics of another shape are present.
+        """
+        if self.count.shape != event_shape:
+            if self.count.numel():
+                raise ValueError(
+                    f"the running statistics are those of entries of shape "
+                    f"{tuple(self.count.shape)}, got {tuple(event_shape)}. Do they belong to "
+                    "another environment? Use a new transform."
+                )
+            zero = torch.zeros(event_shape, dtype=torch.float64, device=device)
+            self._store(Moments(zero, zero.clone(), zero.clone()))
+
+    def learn(self, value: Tensor, observed: Tensor | None) -> bool:
+        """Merge the observed entries of a batch into the statistics.
+
+        Args:
+            value: shape `(samples, *event)`, floating point.
+            observed: shape `(samples, *event)`, bool; None counts every entry.
+
+        Returns:
+            False where an observed entry is NaN or infinite; nothing was learned then.
+        """
+        batch = masked_moments(value, observed)
+        # One scalar leaves the device. It is worth it: a single NaN would spoil the mean for good.
+        if not math.isfinite(batch.m2.sum().item()):
+            return False
+        buffers = self._buffers
+        old = Moments(buffers["count"], buffers["mean"], buffers["m2"])  # type: ignore[arg-type]
+        self._store(merge_moments(old, batch))
+        return True
+
+    def _store(self, moments: Moments) -> None:
+        # Straight into the dictionary: nn.Module's own __setattr__ costs as much as the arithmetic.
+        buffers = self._buffers
+        buffers["count"], buffers["mean"], buffers["m2"] = moments
+        buffers["inverse_scale"] = (variance(moments) + self.eps).rsqrt_()
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        # A fresh transform takes the saved shape; an empty saved state clears a shaped one.
+        saved = state_dict.get(prefix + "count")
+        if saved is not None:
+            # New tensors, so that a state_dict taken earlier is not written over.
+            shape = self.count.shape if self.count.numel() else saved.shape
+            self._store(Moments(*self.count.new_zeros(3, *shape)))
+            if not saved.numel():
+                state_dict = dict(state_dict)
+                for name in ("count", "mean", "m2"):
+                    state_dict[prefix + name] = getattr(self, name)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        self._store(Moments(self.count, self.mean, self.m2))
+
+
+class RunningScaleTransform(OrderedTransform):
+    """Own one set of running moments for every in_key; freeze them, copy them, guard them.
+
+    Copies go their own way from the present statistics: `clone()` learns on, `frozen_copy()` does
+    not. Wrapping a `TransformedEnv` in another makes TorchRL clone the transforms, so read the
+    statistics from the environment's own transform then.
+    """
+
+    moments: nn.ModuleList
+    # The same objects as in `moments`, in a plain list, which is quicker to index at every step.
+    _running: list[RunningMoments]
+
+    def __init__(self, in_keys: Any, out_keys: Any, *, clip: float | None, eps: float) -> None:
+        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        name = type(self).__name__
+        if len(self.in_keys) != len(self.out_keys) or not self.in_keys:
+            raise ValueError(
+                f"`out_keys` of {name} must name one key for every one of the {len(self.in_keys)} "
+                f"in_keys, at least one, got {len(self.out_keys)}."
+            )
+        if clip is not None and not clip > 0:
+            raise ValueError(f"`clip` must be positive, or None for no clipping, got {clip}.")
+        if not (eps > 0 and math.isfinite(eps)):
+            raise ValueError(f"`eps` must be positive and finite, got {eps}.")
+        self.clip = clip
+        self.eps = eps
+        self._frozen = False
+        self._running = [RunningMoments(eps) for _ in self.in_keys]
+        self.moments = nn.ModuleList(self._running)
+
+    @property
+    def frozen(self) -> bool:
+        """Tell whether the statistics are kept as they are."""
+        return self._frozen
+
+    def freeze(self) -> Self:
+        """Stop learning: scale with the present statistics from now on.
+
+        Returns:
+            The transform itself.
+        """
+        self._frozen = True
+        return self
+
+    def unfreeze(self) -> Self:
+        """Learn again.
+
+        Returns:
+            The transform itself.
+        """
+        self._frozen = False
+        return self
+
+    def frozen_copy(self) -> Self:
+        """Copy the transform with its present statistics, frozen, for another environment.
+
+        Returns:
+            A transform without a parent that shares no state with this one.
+        """
+        return self.clone().freeze()
+
+    def clone(self) -> Self:
+        """Copy the transform with its present statistics, without a parent.
+
+        Returns:
+            A transform that shares no state with this one.
+        """
+        twin: Self = super().clone()
+        twin._running = copy.deepcopy(self._running)
+        twin.moments = nn.ModuleList(twin._running)
+        return twin
+
+    def _check_batched_worker_compat(self) -> None:
+        if not self._frozen:
+            raise RuntimeError(
+                f"{type(self).__name__} cannot learn inside a SerialEnv or ParallelEnv: every "
+                "worker would keep statistics of its own and they would drift apart. Put one "
+                "instance around the batched environment, TransformedEnv(ParallelEnv(...), "
+                f"{type(self).__name__}(...)), or put a frozen_copy() into the workers."
+            )
+
+    def _check_collector(self) -> None:
+        # A collector in a worker process knows its index; one in the main process has None.
+        if self._frozen:
+            return
+        collector = getattr(self.container, "collector", None)
+        if getattr(collector, "worker_idx", None) is not None:
+            raise RuntimeError(
+                f"{type(self).__name__} cannot learn in the worker processes of a multi-process "
+                "collector: every process would keep statistics of its own and the agent would be "
+                "saved without them. Collect with one torchrl.collectors.Collector over a batched "
+                "environment, or give the workers a frozen_copy()."
+            )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Scale stored data with frozen statistics; refuse where they are not frozen.
+
+        Args:
+            tensordict: data in its raw units; the in_keys found in it and under `"next"` are
+                scaled.
+
+        Returns:
+            The tensordict with the out_keys written.
+
+        Raises:
+            NotImplementedError: the transform is not frozen. Samples are drawn from a buffer many times
+                over, so learning from them would count each many times.
+        """
+        if not self._frozen:
+            raise NotImplementedError(
+                f"{type(self).__name__} learns while an environment steps and would count stored "
+                "samples many times over. For stored raw data use its frozen_copy(); data that was "
+                "collected through the transform is scaled already."
+            )
+        following = tensordict.get("next", None)
+        for part in (tensordict,) if following is None else (tensordict, following):
+            self._scale(part)
+        return tensordict
+
+    def _scale(self, tensordict: TensorDictBase) -> None:
+        """Write the out_keys with the present statistics."""
+        raise NotImplementedError
