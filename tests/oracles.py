@@ -312,7 +312,7 @@ def simulate(
 
 
 def joint_log_likelihood(system: LinearSystem, data: Data, row: int) -> Tensor:
-    """log density of all observed entries of one row under ONE joint Gaussian.
+    """Log density of all observed entries of one row under ONE joint Gaussian.
 
     The row starts from the initial belief at its first step. Every state is written as a linear
     map of the first state and the process noises, so the stacked observations are one Gaussian

@@ -15,6 +15,7 @@ Specified here, in float64 unless the test is about float32:
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -101,7 +102,7 @@ class Problem:
             self.restart[0, 2] = self.restart[-1, 1] = True  # with and without a reset beside it
             leaves["restart_mean"] = torch.randn(batch, time, state, generator=g).double()
         widths = [state + system.action_dim, *hidden, state]
-        for i, (fan_in, fan_out) in enumerate(zip(widths, widths[1:], strict=False)):
+        for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
             weight = torch.randn(fan_out, fan_in, generator=g).double()
             leaves[f"weight{i}"] = (0.5 if residual else 1.0) * weight / math.sqrt(fan_in)
             leaves[f"bias{i}"] = 0.1 * torch.randn(fan_out, generator=g).double()
@@ -617,7 +618,9 @@ def test_float32_is_near_float64(state, obs, form):
         assert float((gradient.double() - true_gradients[name]).abs().max()) < 1e-4 * scale, name
 
 
-def at_the_noise_floor(state: int, obs: int, *, full_noise: bool = False) -> tuple[Problem, Problem]:
+def at_the_noise_floor(
+    state: int, obs: int, *, full_noise: bool = False
+) -> tuple[Problem, Problem]:
     """Return one problem in float32 and the same numbers in float64: R std 1e-2, Q std .3.
 
     H is random, masks of every density from empty to complete, and the data come from the model

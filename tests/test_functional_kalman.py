@@ -15,6 +15,7 @@ Specified here, in float64 unless the test is about float32:
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import oracles
@@ -52,7 +53,7 @@ def pattern(kind: str, obs: int, generator: torch.Generator) -> Tensor:
     return mask
 
 
-def case(state: int, obs: int, *, seed: int = 0, batch: int = 5, full_noise: bool = True):  # noqa: ANN201
+def case(state: int, obs: int, *, seed: int = 0, batch: int = 5, full_noise: bool = True):
     """A system, a batch of predicted beliefs, complete observations and offsets."""
     system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
     g = torch.Generator().manual_seed(seed + 77)
@@ -378,10 +379,7 @@ def test_a_batch_equals_a_loop_over_its_members(shape):
     assert filtered.mean.shape == (*shape, 3)
     assert filtered.cov.shape == (*shape, 3, 3)
     assert ll.shape == shape
-    for i in torch.cartesian_prod(*[torch.arange(n) for n in shape], torch.arange(1)).tolist() if (
-        shape
-    ) else [[0]]:
-        index = tuple(i[:-1])
+    for index in itertools.product(*map(range, shape)):
         m, p = oracles.predict(
             mean[index],
             cov[index],
@@ -576,13 +574,14 @@ def test_step_likelihoods_sum_to_one_joint_gaussian_when_the_covariance_is_propa
 ):
     system = oracles.random_system(state, obs, seed=seed, full_noise=True)
     data = oracles.simulate(system, batch=1, time=6, seed=seed)
-    predicted = Belief(system.initial_mean, system.initial_cov)
+    filtered = Belief(system.initial_mean, system.initial_cov)
     total = torch.zeros((), dtype=torch.float64)
     for t in range(6):
         action = data.previous_action[0, t]
+        predicted = filtered
         if t > 0:
             predicted = F.predict(
-                filtered,  # noqa: F821
+                filtered,
                 system.transition,
                 system.transition_cov,
                 action,
@@ -614,7 +613,7 @@ def assert_spd(cov: Tensor, context: str) -> None:
     assert smallest > 0, f"not positive definite {context}: smallest eigenvalue {smallest:.1e}"
 
 
-def float32_case(state: int, obs: int, batch: int, seed: int, *, full_noise: bool):  # noqa: ANN201
+def float32_case(state: int, obs: int, batch: int, seed: int, *, full_noise: bool):
     g = torch.Generator().manual_seed(seed)
     h = torch.randn(obs, state, generator=g)
     q = TRANSITION_STD**2 * torch.eye(state)

@@ -1,15 +1,16 @@
 """FillLastObserved: a missing entry takes the last value of its component observed in this episode.
 
-Specified here, against a loop that fills step by step: values in any arrangement of environments with
-partial resets; `fill_value` before the first observed value; the mask and the raw observation stay where
-they are; what lies under a False mask is never read; the order rule. On top, the duties of every
-transform.
+Specified here, against a loop that fills step by step: values in any arrangement of environments
+with partial resets; `fill_value` before the first observed value; the mask and the raw observation
+stay where they are; what lies under a False mask is never read; the order rule. On top, the duties
+of every transform.
 """
 
 import pytest
 import torch
-from contracts import StaircaseEnv, TransformContract, gym_env
+from contracts import SelfResettingEnv, StaircaseEnv, TransformContract, gym_env
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 
 from torchrl_drbpn.transforms import FillLastObserved, ObservationMissingness, SensorReduction
@@ -42,9 +43,9 @@ class TestFillLastObservedContract(TransformContract):
     def check_output(self, before, after):
         filled, observed = after["observation"], after["observed"]
         assert torch.equal(filled, after["last_observation"])
-        if "observation" in before.keys():
+        if "observation" in before:
             assert torch.equal(filled[observed], before["observation"][observed])
-        if "complete_observation" in after.keys():
+        if "complete_observation" in after:
             assert torch.equal(filled[observed], after["complete_observation"][observed])
 
 
@@ -87,14 +88,21 @@ def test_it_equals_filling_step_by_step(where, fill_value):
 
 
 def test_a_collector_carries_the_last_values_from_batch_to_batch():
-    from torchrl.collectors import Collector
-
     env = masked(TransformedEnv(StaircaseEnv(horizon=5), Compose()))
     env = env.append_transform(FillLastObserved())
     collector = Collector(env, frames_per_batch=12, total_frames=48)
     data = torch.cat(list(collector), -1)
     assert data.shape == (3, 16)
     assert torch.equal(data["observation"], filled_by_hand(data, 0.0))
+
+
+def test_an_environment_that_resets_itself_starts_from_the_fill_value():
+    env = masked(TransformedEnv(SelfResettingEnv(), Compose()))
+    env = env.append_transform(FillLastObserved(fill_value=-7.0))
+    data = env.rollout(17, break_when_any_done=False)
+    assert data["next", "done"].sum() > 6
+    # such an environment overwrites the last observation of an episode: look at the roots alone
+    assert torch.equal(data["observation"], filled_by_hand(data, -7.0))
 
 
 def test_the_mask_stays_as_it_is():
@@ -120,9 +128,7 @@ def test_a_component_that_never_arrives_keeps_the_fill_value():
 @pytest.mark.parametrize("junk", [float("nan"), float("inf"), 1e30])
 def test_what_lies_under_a_false_mask_is_never_read(junk):
     root = TensorDict(last_observation=torch.tensor([1.0, 2.0]))
-    step = TensorDict(
-        observation=torch.tensor([5.0, junk]), observed=torch.tensor([True, False])
-    )
+    step = TensorDict(observation=torch.tensor([5.0, junk]), observed=torch.tensor([True, False]))
     after = FillLastObserved()._step(root, step)
     assert torch.equal(after["observation"], torch.tensor([5.0, 2.0]))
 
@@ -162,16 +168,14 @@ def test_before_missingness_is_refused():
     with pytest.raises(ValueError, match="`FillLastObserved` stands before"):
         TransformedEnv(
             StaircaseEnv(),
-            Compose(
-                SensorReduction([0]), FillLastObserved(), ObservationMissingness("mcar", 0.5)
-            ),
+            Compose(SensorReduction([0]), FillLastObserved(), ObservationMissingness("mcar", 0.5)),
         )
 
 
 def test_without_a_mask_it_says_who_writes_one():
     env = TransformedEnv(StaircaseEnv(), FillLastObserved())
     for use in (env.reset, lambda: env.observation_spec):
-        with pytest.raises(KeyError, match="reads the mask 'observed'.*ObservationMissingness"):
+        with pytest.raises(KeyError, match=r"reads the mask 'observed'.*ObservationMissingness"):
             use()
 
 

@@ -1,8 +1,9 @@
-"""PreviousAction: `previous_action` at step t + 1 is the action chosen at step t, zero after a reset.
+"""PreviousAction: `previous_action` is the action chosen one step before, zero after a reset.
 
-Specified here: the shift by one step with partial resets; that it is the action as the agent chose it,
-not as an action transform earlier in the chain or the environment changed it; that discrete actions
-keep dtype and shape; that nothing private leaks into the data. On top, the duties of every transform.
+Specified here: the shift by one step with partial resets; that it is the action as the agent chose
+it, not as an action transform earlier in the chain or the environment changed it; that discrete
+actions keep dtype and shape; that nothing private leaks into the data. On top, the duties of every
+transform.
 """
 
 import pytest
@@ -34,7 +35,7 @@ class TestPreviousActionContract(TransformContract):
     def test_an_absent_observation_is_named(self):
         # what it reads is the action of the root
         root = self.make_root((3,)).exclude("action")
-        with pytest.raises(KeyError, match="PreviousAction.*action"):
+        with pytest.raises(KeyError, match=r"PreviousAction.*action"):
             self.make_transform()._step(root, self.make_data((3,)))
 
 
@@ -65,8 +66,8 @@ def test_it_is_the_action_of_the_step_before_and_zero_after_every_reset(where):
     assert torch.equal(data["next", "previous_action"], data["action"])
 
 
-class DoublingEnv(StaircaseEnv):
-    """Accepts actions in [-1, 1] and overwrites what it was given, as an environment may that clips."""
+class KeepingEnv(StaircaseEnv):
+    """Takes actions in [-1, 1] and keeps what it received."""
 
     def __init__(self):
         super().__init__()
@@ -90,14 +91,14 @@ class Halve(Transform):
 
 
 def test_it_is_the_chosen_action_not_the_one_that_the_simulator_received():
-    env = TransformedEnv(DoublingEnv(), Compose(Halve(), PreviousAction()))
+    env = TransformedEnv(KeepingEnv(), Compose(Halve(), PreviousAction()))
     data = env.rand_step(env.reset())
     assert torch.equal(env.base_env.received, data["action"] / 2)
     assert torch.equal(data["next", "previous_action"], data["action"])
 
 
 def test_action_transforms_later_in_the_chain_have_been_at_it():
-    env = TransformedEnv(DoublingEnv(), Compose(PreviousAction(), Halve()))
+    env = TransformedEnv(KeepingEnv(), Compose(PreviousAction(), Halve()))
     data = env.rand_step(env.reset())
     assert torch.equal(data["next", "previous_action"], data["action"] / 2)
 
@@ -134,7 +135,7 @@ def test_other_keys_can_be_named():
 
 def test_an_absent_action_is_named():
     env = TransformedEnv(StaircaseEnv(), PreviousAction("torque"))
-    with pytest.raises(KeyError, match="PreviousAction.*torque"):
+    with pytest.raises(KeyError, match=r"PreviousAction.*torque"):
         env.reset()
 
 

@@ -93,6 +93,7 @@ class _Run:
             settings.logger.backend, logger_name=str(folder), experiment_name="logs"
         )
         self.evaluation_envs: dict[int, TransformedEnv] = {}
+        self.clock = time.perf_counter()
         self.saved_frames = training.progress.frames if resumed else -1
 
     def go(self) -> None:
@@ -100,6 +101,7 @@ class _Run:
         settings, progress = self.settings, self.training.progress
         say(f"run folder: {self.folder}")
         first_frames, first_seconds = progress.frames, progress.train_seconds
+        self.clock = time.perf_counter()
         with ProgressBar(settings.total_frames, progress.frames) as bar:
             while progress.frames < settings.total_frames and not self.stop:
                 row = self._timed_rollout()
@@ -124,9 +126,11 @@ class _Run:
 
     def _timed_rollout(self) -> dict[str, Any]:
         progress = self.training.progress
-        before, start = progress.frames, time.perf_counter()
+        before = progress.frames
         row = train_rollout(self.training, self.settings)
-        seconds = time.perf_counter() - start
+        # Logging and saving since the last update count; evaluation has moved the clock on.
+        now = time.perf_counter()
+        seconds, self.clock = now - self.clock, now
         progress.train_seconds += seconds
         row["steps_per_second"] = (progress.frames - before) / seconds
         row["wall_time"] = progress.train_seconds
@@ -163,6 +167,13 @@ class _Run:
             say(_summary(rows))
 
     def _evaluate(self, kind: str, episodes: int) -> list[dict[str, Any]] | None:
+        start = time.perf_counter()
+        try:
+            return self._evaluate_modes(kind, episodes)
+        finally:
+            self.clock += time.perf_counter() - start
+
+    def _evaluate_modes(self, kind: str, episodes: int) -> list[dict[str, Any]] | None:
         settings, training = self.settings, self.training
         if episodes not in self.evaluation_envs:
             self.evaluation_envs[episodes] = make_evaluation_environment(

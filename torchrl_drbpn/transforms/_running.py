@@ -91,18 +91,25 @@ class RunningMoments(nn.Module):
         """Merge the observed entries of a batch into the statistics.
 
         Args:
-            value: shape `(samples, *event)`, floating point.
-            observed: shape `(samples, *event)`, bool; None counts every entry.
+            value: shape `(*batch, *event)`, floating point.
+            observed: shape `(*batch, *event)`, bool; None counts every entry.
 
         Returns:
             False where an observed entry is NaN or infinite; nothing was learned then.
         """
+        buffers = self._buffers
+        count = cast(Tensor, buffers["count"])
+        # A differentiable environment must not be remembered for ever.
+        value = value.detach()
+        if value.ndim != count.ndim + 1:
+            shape = (-1, *count.shape)
+            value = value.reshape(shape)
+            observed = None if observed is None else observed.reshape(shape)
         batch = masked_moments(value, observed)
         # One scalar leaves the device. It is worth it: a single NaN would spoil the mean for good.
         if not math.isfinite(batch.m2.sum().item()):
             return False
-        buffers = self._buffers
-        old = Moments(buffers["count"], buffers["mean"], buffers["m2"])  # type: ignore[arg-type]
+        old = Moments(count, cast(Tensor, buffers["mean"]), cast(Tensor, buffers["m2"]))
         self._store(merge_moments(old, batch))
         return True
 
@@ -223,6 +230,14 @@ class RunningScaleTransform(OrderedTransform):
                 "environment, or give the workers a frozen_copy()."
             )
 
+    def _moments_for(self, index: int, value: Tensor, batch_dims: int) -> RunningMoments:
+        """Return the moments of an in_key, shaped after the entries that it turns out to have."""
+        moments = self._running[index]
+        event_shape = value.shape[batch_dims:]
+        if moments.count.shape != event_shape:
+            moments.initialise(event_shape, value.device)
+        return moments
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Scale stored data with frozen statistics; refuse where they are not frozen.
 
@@ -234,8 +249,8 @@ class RunningScaleTransform(OrderedTransform):
             The tensordict with the out_keys written.
 
         Raises:
-            NotImplementedError: the transform is not frozen. Samples are drawn from a buffer many times
-                over, so learning from them would count each many times.
+            NotImplementedError: the transform is not frozen. Samples are drawn from a buffer many
+                times over, so learning from them would count each many times.
         """
         if not self._frozen:
             raise NotImplementedError(

@@ -120,7 +120,8 @@ class FillLastObserved(OrderedTransform):
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # The first observation was filled as the last of the episode before; the mask tells where.
+        # The first observation was filled as if its episode were the one before; the mask tells
+        # where. Exact unless a transform after this one has rescaled the observation.
         for mask_key, out_key, state_key in zip(
             self.mask_keys, self.out_keys, self.state_keys, strict=True
         ):
@@ -129,9 +130,9 @@ class FillLastObserved(OrderedTransform):
             if rows is not None and value is not None:
                 observed = read(tensordict_reset, mask_key, self)
                 stale = spread_rows(rows, value) & ~observed
-                filled = torch.where(stale, self.fill_value, value)
-                tensordict_reset.set(out_key, filled)
-                tensordict_reset.set(state_key, filled)
+                last = read(tensordict_reset, state_key, self)
+                tensordict_reset.set(out_key, value.masked_fill(stale, self.fill_value))
+                tensordict_reset.set(state_key, last.masked_fill(stale, self.fill_value))
         return tensordict_reset
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -189,6 +190,7 @@ class FillLastObserved(OrderedTransform):
 
 def _no_mask(mask_key: NestedKey) -> KeyError:
     return KeyError(
-        f"`FillLastObserved` reads the mask {mask_key!r}, which the environment does not write. Put "
-        "ObservationMissingness, SensorReduction or ObservedFromNaN before it, or pass mask_keys=... ."
+        f"`FillLastObserved` reads the mask {mask_key!r}, which the environment does not write. "
+        "Put ObservationMissingness, SensorReduction or ObservedFromNaN before it, or pass "
+        "mask_keys=... ."
     )

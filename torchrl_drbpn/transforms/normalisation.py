@@ -144,8 +144,8 @@ class MaskedObservationNorm(RunningScaleTransform):
         if self._filled is None:
             self._filled = self._find_filled()
         for index, key in enumerate(self.in_keys):
-            moments = self._running[index]
             value = read(tensordict, key, self)
+            moments = self._moments_for(index, value, tensordict.ndim)
             observed = tensordict.get(self.mask_keys[index], None)
             if observed is not None and (
                 observed.dtype is not torch.bool or observed.shape != value.shape
@@ -155,9 +155,6 @@ class MaskedObservationNorm(RunningScaleTransform):
                     f"entry for every component of {key!r}, got {observed.dtype} of shape "
                     f"{tuple(observed.shape)}. Is it the mask of another observation?"
                 )
-            event_shape = value.shape[tensordict.ndim :]
-            if moments.count.shape != event_shape:
-                moments.initialise(event_shape, value.device)
             double = value.double()
             if learns:
                 rows = flagged_rows(cast(TensorDictBase, flags), flag, key)
@@ -165,10 +162,7 @@ class MaskedObservationNorm(RunningScaleTransform):
                 if rows is not None:
                     rows = spread_rows(rows, value)
                     counted = rows if observed is None else observed & rows
-                if not moments.learn(
-                    double.reshape(-1, *event_shape),
-                    None if counted is None else counted.reshape(-1, *event_shape),
-                ):
+                if not moments.learn(double, counted):
                     raise ValueError(
                         f"`{key}` holds NaN or an infinity where {self.mask_keys[index]!r} says "
                         "that it was observed. For sensors that report NaN put ObservedFromNaN "

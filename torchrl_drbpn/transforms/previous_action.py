@@ -7,7 +7,9 @@ from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase, Transform
 
 from torchrl_drbpn.transforms._common import OrderedTransform, Role, as_key_list, pair_keys, read
 from torchrl_drbpn.transforms._running import flagged_rows, spread_rows
@@ -53,6 +55,7 @@ class PreviousAction(OrderedTransform):
         inputs = as_key_list(in_keys)
         outputs = pair_keys(inputs, out_keys, name="out_keys", default="previous_action")
         super().__init__(in_keys=inputs, out_keys=outputs)
+        self._layouts: dict[NestedKey, tuple[torch.Size, torch.dtype]] = {}
         # What travels from the way in to the way out, where earlier action transforms have
         # overwritten the action: one private entry per action, never seen outside a step.
         self._chosen = [
@@ -81,12 +84,35 @@ class PreviousAction(OrderedTransform):
         del tensordict
         # Every row: the environment keeps the old values of the rows that are not reset.
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            if self.parent is None:
-                zero = torch.zeros_like(read(tensordict_reset, key, self))
-            else:
-                zero = self._action_spec(key).zero()
-            tensordict_reset.set(out_key, zero)
+            tensordict_reset.set(out_key, self._zero(key, tensordict_reset))
         return tensordict_reset
+
+    def _zero(self, key: NestedKey, tensordict_reset: TensorDictBase) -> Tensor:
+        # Specs are slow to ask and short episodes reset often: only the first reset asks.
+        layout = self._layouts.get(key)
+        if layout is None:
+            if self.parent is None:
+                return torch.zeros_like(read(tensordict_reset, key, self))
+            spec = self._action_spec(key)
+            event_shape = spec.shape[len(self.parent.batch_size) :]
+            layout = self._layouts[key] = (event_shape, spec.dtype)
+        event_shape, dtype = layout
+        shape = (*tensordict_reset.batch_size, *event_shape)
+        return torch.zeros(shape, dtype=dtype, device=self.parent.device)
+
+    def empty_cache(self) -> None:
+        """Forget what was read from the specs."""
+        super().empty_cache()
+        self._layouts = {}
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Attach the transform.
+
+        Args:
+            container: the environment or the `Compose` that takes the transform.
+        """
+        super().set_container(container)
+        self._layouts = {}
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

@@ -12,6 +12,7 @@ from torchrl.data import Composite, TensorSpec
 
 from torchrl_drbpn.transforms._common import Role, as_key_list, pair_keys, read, unbounded_like
 from torchrl_drbpn.transforms._running import (
+    RunningMoments,
     RunningScaleTransform,
     flagged_rows,
     spread_rows,
@@ -95,8 +96,9 @@ class RunningReturnScale(RunningScaleTransform):
         return self._running[0].inverse_scale.reciprocal()
 
     # ---------------------------------------------------------------------------- action on data
-    def _write(self, tensordict: TensorDictBase, index: int, reward: Tensor) -> None:
-        moments = self._running[index]
+    def _write(
+        self, tensordict: TensorDictBase, index: int, reward: Tensor, moments: RunningMoments
+    ) -> None:
         scaled = reward * moments.inverse_scale
         if self.clip is not None:
             scaled = scaled.clamp_(-self.clip, self.clip)
@@ -104,25 +106,20 @@ class RunningReturnScale(RunningScaleTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         for index, key in enumerate(self.in_keys):
-            moments = self._running[index]
             reward = read(next_tensordict, key, self)
+            moments = self._moments_for(index, reward, next_tensordict.ndim)
             state_key = self.state_keys[index]
             previous = tensordict.get(state_key, None)
             discounted = reward if previous is None else previous * self.gamma + reward
-            event_shape = reward.shape[next_tensordict.ndim :]
-            if moments.count.shape != event_shape:
-                moments.initialise(event_shape, reward.device)
             if not self._frozen:
                 rows = flagged_rows(tensordict, "_step", key)
-                counted = None
-                if rows is not None:
-                    counted = spread_rows(rows, reward).reshape(-1, *event_shape)
-                if not moments.learn(discounted.reshape(-1, *event_shape), counted):
+                counted = None if rows is None else spread_rows(rows, reward)
+                if not moments.learn(discounted, counted):
                     raise ValueError(
                         f"`{key}` holds NaN or an infinity. RunningReturnScale would scale every "
                         "later reward by it; look at the environment's reward."
                     )
-            self._write(next_tensordict, index, reward)
+            self._write(next_tensordict, index, reward, moments)
             next_tensordict.set(state_key, discounted)
         return next_tensordict
 
@@ -160,7 +157,8 @@ class RunningReturnScale(RunningScaleTransform):
             reward = tensordict.get(key, None)
             # The root of a stored step has no reward, its "next" has.
             if reward is not None:
-                self._write(tensordict, index, reward)
+                moments = self._moments_for(index, reward, tensordict.ndim)
+                self._write(tensordict, index, reward, moments)
 
     # ------------------------------------------------------------------------------------- specs
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
