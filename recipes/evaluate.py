@@ -1,7 +1,7 @@
 """Evaluate a trained agent: ``python recipes/evaluate.py run=<folder> points=[none:0,mcar:0.5]``.
 
-The last checkpoint of the run acts under each kind of missingness, with frozen normalisation and the
-noise of its training. One row an episode goes to a CSV file, written whole or not at all.
+The last checkpoint of the run acts under each kind of missingness, with frozen normalisation and
+the noise of its training. One row an episode goes to a CSV file, written whole or not at all.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from typing import Any, cast
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
-
 from assembly.console import run_or_explain, say
 from assembly.errors import UserError
 from assembly.points import episode_rows, evaluate_points
 from assembly.run_folder import write_table
 from assembly.trained import load_trained_agent
+from omegaconf import DictConfig, OmegaConf
 
 
 def run(config: dict[str, Any]) -> int:

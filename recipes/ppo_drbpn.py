@@ -1,7 +1,8 @@
 """Train an agent on incomplete, noisy sensors: ``python recipes/ppo_drbpn.py env=walker2d``.
 
 Settings and their defaults stand in conf/. A run leaves its configuration, tables, checkpoints and
-versions in ``runs/<env>-<version>-<belief>-seed<seed>-<time>``; ``resume=<that folder>`` continues it.
+versions in ``runs/<env>-<version>-<belief>-seed<seed>-<time>``; ``resume=<that folder>`` continues
+it. Ctrl-C and SIGTERM save after the rollout in progress and leave with status 130 or 143.
 """
 
 from __future__ import annotations
@@ -12,12 +13,11 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-
 from assembly.console import run_or_explain
 from assembly.resume import resumed_config
 from assembly.run import run
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
 
 # A resumed run stays in its own folder; see hydra.run.dir in conf/config.yaml.
 OmegaConf.register_new_resolver("run_folder", lambda resume, new: resume or new, replace=True)

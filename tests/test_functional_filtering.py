@@ -24,7 +24,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.filtering import (
+from torchrl_drbpn.functional import (
     StateSpace,
     choose_form,
     filter_sequence,

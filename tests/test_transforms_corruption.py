@@ -282,6 +282,17 @@ def test_a_mask_that_is_there_is_anded_and_garbage_beneath_it_is_harmless(transf
     assert torch.equal(after["observation"], after["observed"].float())
 
 
+def test_garbage_beneath_a_mask_does_not_enter_the_law():
+    root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
+    drawn = []
+    for beneath in (0.0, math.nan, math.inf, 1e6):
+        before = data(1.0, observed=existing_mask())
+        before["observation"][:, 2] = beneath
+        drawn.append(ObservationMissingness("nmar", 0.9)._step(root, before)["observed"])
+    assert not drawn[0].all(0)[[0, 1, 3, 4]].all()
+    assert all(torch.equal(mask, drawn[0]) for mask in drawn)
+
+
 def test_noise_leaves_missing_entries_at_zero():
     after = ObservationNoise(1.0)._call(data(0.0, observed=existing_mask()))
     assert (after["observation"][:, 2] == 0).all()

@@ -8,7 +8,8 @@ of every transform.
 
 import pytest
 import torch
-from contracts import SelfResettingEnv, StaircaseEnv, TransformContract, gym_env
+from contracts import StaircaseEnv, TransformContract, gym_env
+from self_resetting import SelfResettingEnv
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
@@ -85,6 +86,20 @@ def test_it_equals_filling_step_by_step(where, fill_value):
     assert (data["observed"].float().mean() - 0.5).abs() < 0.2
     data = data.reshape(-1, 17)
     assert torch.equal(data["observation"], filled_by_hand(data, fill_value))
+
+
+def test_a_step_in_a_worker_reads_the_last_values_that_it_is_given():
+    def worker():
+        return masked(TransformedEnv(StaircaseEnv(), Compose())).append_transform(
+            FillLastObserved()
+        )
+
+    env = SerialEnv(2, worker)
+    root = env.reset()
+    root["last_observation"] = torch.full_like(root["last_observation"], -50.0)
+    after = env.rand_step(root)["next"]
+    assert not after["observed"].all()
+    assert (after["observation"][~after["observed"]] == -50).all()
 
 
 def test_a_collector_carries_the_last_values_from_batch_to_batch():

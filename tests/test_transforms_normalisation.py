@@ -1,10 +1,9 @@
-"""MaskedObservationNorm and the running moments beneath it.
+"""MaskedObservationNorm: running mean and variance of the observed entries alone.
 
-Specified here: the moments of masked data are those of the observed values alone, whatever the
-order of the batches; every received observation is learned from once, the first of an episode
-included, rows that are not reset or not stepped excluded; missing entries stay 0 and never enter; a
-complete observation is scaled but not learned from; frozen statistics never change; the state
-survives a file; learning in several processes is refused. On top, the duties of every transform.
+Specified here: every received observation is learned from once, the first of an episode included,
+rows that are not reset or not stepped excluded; missing entries stay 0 and never enter; a complete
+observation is scaled but not learned from; frozen statistics never change; the state survives a
+file; learning in several processes is refused. On top, the duties of every transform.
 """
 
 import pickle
@@ -12,13 +11,13 @@ import pickle
 import pytest
 import torch
 from contracts import OBS, StaircaseEnv, TransformContract, gym_env, saved, with_transform
+from self_resetting import SelfResettingEnv
 from tensordict import TensorDict
 from torchrl.collectors import MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, DoubleToFloat, GymEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_drbpn.functional.statistics import Moments, masked_moments, merge_moments, variance
 from torchrl_drbpn.transforms import (
     FillLastObserved,
     MaskedObservationNorm,
@@ -60,86 +59,6 @@ def state(norm):
 def same(first, second):
     """Tell whether two sets of statistics are equal to the last bit."""
     return first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
-
-
-# ---------------------------------------------------------------------------------------- moments
-@pytest.mark.parametrize("seed", range(3))
-def test_masked_moments_are_those_of_the_observed_values_alone(seed):
-    value, observed = draw(50, 4, seed)
-    moments = masked_moments(value, observed)
-    for i in range(4):
-        kept = value[observed[:, i], i]
-        assert moments.n[i] == len(kept)
-        torch.testing.assert_close(moments.mean[i], kept.mean(), **TIGHT)
-        torch.testing.assert_close(variance(moments)[i], torch.var(kept, correction=0), **TIGHT)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_merging_gives_the_same_in_any_order_and_grouping(seed):
-    value, observed = draw(97, 3, seed)
-    whole = masked_moments(value, observed)
-    generator = torch.Generator().manual_seed(seed)
-    batches = [
-        masked_moments(*pair)
-        for pair in zip(
-            value.split([1, 40, 7, 2, 47]), observed.split([1, 40, 7, 2, 47]), strict=True
-        )
-    ]
-    for _ in range(5):
-        order = torch.randperm(5, generator=generator).tolist()
-        merged = Moments(*torch.zeros(3, 3, dtype=torch.float64))
-        for index in order:
-            merged = merge_moments(merged, batches[index])
-        right = merge_moments(batches[order[3]], batches[order[4]])
-        tree = merge_moments(
-            merge_moments(batches[order[0]], batches[order[1]]),
-            merge_moments(batches[order[2]], right),
-        )
-        for other in (merged, tree):
-            for a, b in zip(other, whole, strict=True):
-                torch.testing.assert_close(a, b, **TIGHT)
-
-
-def test_merging_with_nothing_observed_changes_nothing():
-    value, observed = draw(20, 3)
-    moments = masked_moments(value, observed)
-    nothing = masked_moments(value, torch.zeros_like(observed))
-    for merged in (merge_moments(moments, nothing), merge_moments(nothing, moments)):
-        for a, b in zip(merged, moments, strict=True):
-            assert torch.equal(a, b)
-
-
-def test_no_mask_equals_a_mask_of_ones():
-    value, _ = draw(20, 3, missing=0.0)
-    for a, b in zip(
-        masked_moments(value), masked_moments(value, torch.ones_like(value).bool()), strict=True
-    ):
-        torch.testing.assert_close(a, b, **TIGHT)
-
-
-def test_a_mean_far_larger_than_the_spread_costs_no_precision():
-    # the textbook formula E[x^2] - E[x]^2 would lose all 16 digits here: 1e8^2 = 1e16
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(1000, 2, generator=generator, dtype=torch.float64)
-    merged = Moments(*torch.zeros(3, 2, dtype=torch.float64))
-    for batch in (noise + 1e8).split(10):
-        merged = merge_moments(merged, masked_moments(batch))
-    torch.testing.assert_close(variance(merged), noise.var(0, correction=0), rtol=1e-6, atol=0.0)
-
-
-@pytest.mark.parametrize("seen", [0, 1])
-def test_with_fewer_than_two_values_the_variance_is_one(seen):
-    observed = torch.arange(5)[:, None] < seen
-    value = torch.full((5, 1), 3.0, dtype=torch.float64)
-    assert variance(masked_moments(value, observed)).item() == 1.0
-
-
-@pytest.mark.parametrize(
-    ("mask", "error"), [(torch.ones(4, 2), TypeError), (torch.ones(4).bool(), ValueError)]
-)
-def test_moments_refuse_a_mask_of_wrong_dtype_or_shape(mask, error):
-    with pytest.raises(error, match="`observed` must"):
-        masked_moments(torch.zeros(4, 2), mask)
 
 
 # ----------------------------------------------------------------------------------------- duties
@@ -266,6 +185,13 @@ def test_over_a_serial_env_it_learns_from_the_rows_that_are_reset():
     resets = 2 + data["next", "done"][:, :, :-1].sum()
     assert resets > 6
     assert (env.transform.moments[0].count == 2 * 12 + resets).all()
+
+
+def test_an_environment_that_resets_itself_sends_every_observation_once():
+    env = TransformedEnv(SelfResettingEnv(), MaskedObservationNorm())
+    data = env.rollout(11, break_when_any_done=False)
+    assert data["next", "done"].any()
+    assert (env.transform.moments[0].count == 3 * 12).all()
 
 
 def test_rows_that_did_not_step_are_not_learned_from():

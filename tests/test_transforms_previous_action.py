@@ -9,6 +9,7 @@ transform.
 import pytest
 import torch
 from contracts import StaircaseEnv, TransformContract
+from self_resetting import SelfResettingEnv
 from torchrl.data import Bounded, Composite
 from torchrl.envs import ActionScaling, Compose, GymEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -64,6 +65,13 @@ def test_it_is_the_action_of_the_step_before_and_zero_after_every_reset(where):
     assert not torch.equal(done, done[..., :1, :, :].expand_as(done))
     assert torch.equal(data["previous_action"], expected_shift(data))
     assert torch.equal(data["next", "previous_action"], data["action"])
+
+
+def test_it_is_zero_where_an_environment_resets_itself():
+    env = TransformedEnv(SelfResettingEnv(), PreviousAction())
+    data = env.rollout(11, break_when_any_done=False)
+    assert data["next", "done"].any()
+    assert torch.equal(data["previous_action"], expected_shift(data))
 
 
 class KeepingEnv(StaircaseEnv):

@@ -79,6 +79,21 @@ def test_noise_and_masks_of_one_seed_are_unrelated():
         assert correlation.abs() < 4 / math.sqrt(zeros.numel())
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("mechanism", ["mcar", "nmar"])
+def test_data_on_a_gpu_stays_there_with_the_same_mechanism(mechanism):
+    root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
+    here, there = (ObservationMissingness(mechanism, 0.5) for _ in range(2))
+    here._step(root, data())
+    first = there._step(root.to("cuda"), data().to("cuda"))
+    assert first["observation"].is_cuda
+    assert first["observed"].is_cuda
+    assert torch.equal(first["observation"] == 1, first["observed"])
+    if mechanism != "mcar":
+        assert all(map(torch.equal, here.mechanism_parameters, there.mechanism_parameters))
+
+
 @pytest.mark.parametrize("mechanism", ["mcar", "mar", "nmar"])
 def test_the_first_observation_of_an_episode_is_corrupted_too(mechanism):
     env = staircase(ObservationMissingness(mechanism, 0.9), batch=50)

@@ -34,6 +34,7 @@ class ProgressBar:
         )
 
     def __enter__(self) -> ProgressBar:
+        """Show the bar."""
         return self
 
     def __exit__(
@@ -42,6 +43,7 @@ class ProgressBar:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        """Leave the bar where it is."""
         self._bar.close()
 
     def update(self, row: Mapping[str, Any]) -> None:
@@ -57,7 +59,9 @@ class ProgressBar:
             ("steps/s", "steps_per_second", "{:.0f}"),
         )
         texts = [
-            f"{name} {form.format(row[key])}" for name, key, form in shown if row.get(key) is not None
+            f"{name} {form.format(row[key])}"
+            for name, key, form in shown
+            if row.get(key) is not None
         ]
         self._bar.set_postfix_str(", ".join(texts), refresh=False)
         self._bar.update(row["frames"] - self._bar.n)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 from torchrl.envs import (
     Compose,
@@ -29,6 +30,12 @@ from torchrl_drbpn import (
     seed_env,
 )
 from torchrl_drbpn.envs import GymnasiumBatchEnv
+
+_MECHANISMS: dict[str, Literal["mcar", "mar", "nmar"]] = {
+    "mcar": "mcar",
+    "mar": "mar",
+    "nmar": "nmar",
+}
 
 
 def make_environment(
@@ -71,7 +78,7 @@ def make_environment(
     none = missingness.mechanism == "none"
     transforms += [
         ObservationMissingness(
-            "mcar" if none else missingness.mechanism,
+            "mcar" if none else _MECHANISMS[missingness.mechanism],
             0.0 if none else missingness.eta,
             always_observed=missingness.always_observed,
             mechanism_seed=missingness.mechanism_seed,

@@ -20,7 +20,7 @@ def read_point(text: str, trained: MissingnessSettings) -> MissingnessSettings:
 
     Args:
         text: ``mechanism:eta``, or ``trained`` for what the agent was trained with.
-        trained: gives what the text leaves open: the mechanism's seed and the always observed share.
+        trained: gives what the text leaves open: mechanism seed, always observed share.
 
     Returns:
         The missingness.
@@ -113,7 +113,7 @@ def episode_rows(
         "mechanism_seed": missingness.mechanism_seed,
         "mode": mode,
     }
-    likelihoods = result.log_likelihoods or [None] * len(result.returns)
+    likelihoods: Sequence[float | None] = result.log_likelihoods or [None] * len(result.returns)
     columns = zip(result.returns, result.lengths, result.missing_ratios, likelihoods, strict=True)
     return [
         common

@@ -89,6 +89,7 @@ class _Run:
         frames = training.progress.frames if resumed else None
         self.metrics = Table(folder / "metrics.csv", metric_columns(training), frames)
         self.evaluations = Table(folder / "evaluation.csv", EVALUATION_COLUMNS, frames)
+        self.episodes = Table(folder / "episodes.csv", ("frames", "return", "length"), frames)
         self.logger: Logger = get_logger(
             settings.logger.backend, logger_name=str(folder), experiment_name="logs"
         )
@@ -104,8 +105,9 @@ class _Run:
         self.clock = time.perf_counter()
         with ProgressBar(settings.total_frames, progress.frames) as bar:
             while progress.frames < settings.total_frames and not self.stop:
-                row = self._timed_rollout()
-                self.metrics.append(row)
+                row, finished = self._timed_rollout()
+                self.metrics.append([row])
+                self.episodes.append(finished)
                 self._log(row)
                 bar.update(row)
                 self._evaluate_when_due(bar)
@@ -124,17 +126,17 @@ class _Run:
             return
         self._final_evaluation()
 
-    def _timed_rollout(self) -> dict[str, Any]:
+    def _timed_rollout(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         progress = self.training.progress
         before = progress.frames
-        row = train_rollout(self.training, self.settings)
+        row, finished = train_rollout(self.training, self.settings)
         # Logging and saving since the last update count; evaluation has moved the clock on.
         now = time.perf_counter()
         seconds, self.clock = now - self.clock, now
         progress.train_seconds += seconds
         row["steps_per_second"] = (progress.frames - before) / seconds
         row["wall_time"] = progress.train_seconds
-        return row
+        return row, finished
 
     def _log(self, row: Mapping[str, Any], prefix: str = "train") -> None:
         for key, value in row.items():
@@ -195,8 +197,8 @@ class _Run:
                 {"frames": training.progress.frames, "kind": kind, "mode": mode}
                 | evaluation_row(result)
             )
+        self.evaluations.append(rows)
         for row in rows:
-            self.evaluations.append(row)
             self._log(row, f"evaluation_{row['mode']}")
         return rows
 

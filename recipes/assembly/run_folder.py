@@ -125,15 +125,15 @@ class Table:
                         kept.append({c: row.get(c, "") for c in self.columns})
         write_whole(path, _csv_text(self.columns, kept))
 
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Append one row.
+    def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Append rows.
 
         Args:
-            row: values by column; an absent one or None is an empty cell, others are left out.
+            rows: values by column; an absent one or None is an empty cell, others are left out.
         """
-        cells = {column: row.get(column) for column in self.columns}
         with self.path.open("a", newline="", encoding="utf-8") as file:
-            csv.DictWriter(file, self.columns, lineterminator="\n").writerow(cells)
+            writer = csv.DictWriter(file, self.columns, lineterminator="\n")
+            writer.writerows({c: row.get(c) for c in self.columns} for row in rows)
 
 
 def _csv_text(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:

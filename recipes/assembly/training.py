@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.objectives import LossModule
@@ -138,7 +138,9 @@ def make_agent(settings: Settings) -> tuple[Belief, Agent]:
     return belief, Agent(belief, action_dim, settings.heads)
 
 
-def train_rollout(training: Training, settings: Settings) -> dict[str, Any]:
+def train_rollout(
+    training: Training, settings: Settings
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Collect one rollout and learn from it.
 
     Args:
@@ -146,18 +148,18 @@ def train_rollout(training: Training, settings: Settings) -> dict[str, Any]:
         settings: of the run.
 
     Returns:
-        What there is to log, see :func:`metric_columns`; the times are left to the caller.
+        What there is to log, see :func:`metric_columns`, where the times are left to the caller;
+        and ``frames``, ``return`` (raw) and ``length`` of each episode that finished.
     """
     progress = training.progress
     lr = settings.optim.lr * max(0.0, 1 - progress.frames / settings.total_frames)
     data = training.collector.rollout()
     add_advantages(data, training.agent, training.gae)
     sequences = to_sequences(data, training.loss, settings.optim.sequence_length)
-    done = data.get(("next", "done"))
-    finished = data.get(("next", "episode_reward"))[done].tolist()
     progress.frames += data.numel()
+    finished = _finished_episodes(data, progress.frames)
     progress.episodes += len(finished)
-    progress.returns.extend(finished)
+    progress.returns.extend(episode["return"] for episode in finished)
     row = {
         "frames": progress.frames,
         "episodes": progress.episodes,
@@ -170,7 +172,18 @@ def train_rollout(training: Training, settings: Settings) -> dict[str, Any]:
         **training.belief.summary(),
     }
     # The rollout's own log-likelihood, of data not yet learned from, goes before the update's.
-    return _update(training, sequences, settings.optim, lr) | row
+    return _update(training, sequences, settings.optim, lr) | row, finished
+
+
+def _finished_episodes(data: TensorDictBase, frames: int) -> list[dict[str, Any]]:
+    """Return the episodes that ended in a rollout, in the order of time."""
+    # Time first, so that the order does not depend on the environment's place in the batch.
+    done, returns, lengths = (
+        data.get(("next", key)).squeeze(-1).transpose(0, 1)
+        for key in ("done", "episode_reward", "step_count")
+    )
+    pairs = zip(returns[done].tolist(), lengths[done].tolist(), strict=True)
+    return [{"frames": frames, "return": value, "length": length} for value, length in pairs]
 
 
 def _update(
@@ -189,7 +202,7 @@ def _update(
             total = sum(value for key, value in terms.items() if key.startswith("loss"))
             assert isinstance(total, torch.Tensor)
             optimizer.zero_grad(set_to_none=True)
-            total.backward()
+            torch.autograd.backward(total)
             terms["grad_norm"] = torch.nn.utils.clip_grad_norm_(parameters, optim.max_grad_norm)
             optimizer.step()
             for key, value in terms.items():

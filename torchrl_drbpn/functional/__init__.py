@@ -1,13 +1,19 @@
 """Pure tensor maths of the belief filter and of the corruption; torch alone."""
 
+from torchrl_drbpn.functional.corruption import (
+    MissingnessKind,
+    MissingnessMechanism,
+    count_always_observed,
+    draw_mechanism,
+    missing_probability,
+    sample_noise,
+    sample_observed,
+)
 from torchrl_drbpn.functional.filtering import (
     FilterOutput,
-    StateSpace,
-    choose_form,
     filter_sequence,
     filter_step,
     filtered_cov,
-    predict_step,
 )
 from torchrl_drbpn.functional.gaussian import (
     Belief,
@@ -20,14 +26,20 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
+from torchrl_drbpn.functional.model import Form, StateSpace, choose_form, predict_step
 from torchrl_drbpn.functional.recurrence import MeanNetwork
 
 __all__ = [
     "Belief",
     "FilterOutput",
+    "Form",
     "MeanNetwork",
+    "MissingnessKind",
+    "MissingnessMechanism",
     "StateSpace",
     "choose_form",
+    "count_always_observed",
+    "draw_mechanism",
     "filter_sequence",
     "filter_step",
     "filtered_cov",
@@ -37,9 +49,12 @@ __all__ = [
     "log_likelihood",
     "masked_cov",
     "masked_log_density",
+    "missing_probability",
     "positive_std",
     "predict",
     "predict_step",
+    "sample_noise",
+    "sample_observed",
     "tril_to_vector",
     "update",
     "zero_missing",

@@ -11,81 +11,28 @@ Three ways give the same numbers; :func:`filter_sequence` chooses:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import LOG_2PI, Belief, masked_cov, zero_missing
+from torchrl_drbpn.functional.gaussian import LOG_2PI, masked_cov, zero_missing
 from torchrl_drbpn.functional.kalman import log_likelihood, update
+from torchrl_drbpn.functional.model import (
+    Form,
+    StateSpace,
+    checked_form,
+    constant_cov,
+    initial_belief,
+    predict_step,
+)
 from torchrl_drbpn.functional.recurrence import (
     InformationRecurrence,
     InnovationRecurrence,
     MeanNetwork,
 )
 
-__all__ = [
-    "FilterOutput",
-    "Form",
-    "StateSpace",
-    "StateSpace",
-    "choose_form",
-    "filter_sequence",
-    "filter_step",
-    "filtered_cov",
-    "predict_step",
-]
-
-Form = Literal["auto", "innovation", "information", "loop"]
-
-
-class StateSpace(NamedTuple):
-    r"""Hold the tensors of a linear-Gaussian-emission state-space model (eq. 2, 3, 8 [DRBPN]).
-
-    .. math::
-        s_t = f(s_{t-1}, a_{t-1}) + N(0, Q), \qquad
-        x_t = H s_t + B a_{t-1} + d + N(0, R), \qquad
-        s_1 \sim N(m_0, P_0)
-
-    Args:
-        transition: f; a :class:`MeanNetwork` opens the fast forms, any callable of
-            (mean, action) goes through the loop.
-        transition_cov: Q, shape ``(state, state)``, or a callable of (mean, action) that returns
-            ``(*batch, state, state)``.
-        emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for the variances of a diagonal R.
-        action_matrix: B, shape ``(obs, action)``.
-        emission_offset: d, shape ``(obs,)``.
-        initial_mean: m_0, shape ``(state,)``.
-        initial_cov: P_0, shape ``(state, state)``.
-
-    Example:
-        >>> import torch
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(
-        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...     torch.zeros(2), eye)
-        >>> model.full_emission_cov().shape
-        torch.Size([2, 2])
-    """
-
-    transition: MeanNetwork | Callable[[Tensor, Tensor], Tensor]
-    transition_cov: Tensor | Callable[[Tensor, Tensor], Tensor]
-    emission_matrix: Tensor
-    emission_cov: Tensor
-    action_matrix: Tensor
-    emission_offset: Tensor
-    initial_mean: Tensor
-    initial_cov: Tensor
-
-    def full_emission_cov(self) -> Tensor:
-        """Return R as a matrix, shape ``(obs, obs)``."""
-        return self.emission_cov.diag() if self.emission_cov.ndim == 1 else self.emission_cov
-
-    def offset(self, previous_action: Tensor) -> Tensor:
-        """Return B a + d, shape ``(*batch, obs)``."""
-        return torch.nn.functional.linear(previous_action, self.action_matrix, self.emission_offset)
+__all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
 
 
 class FilterOutput(NamedTuple):
@@ -107,96 +54,6 @@ class FilterOutput(NamedTuple):
     mean: Tensor
     cov: Tensor | None
     log_likelihood: Tensor
-
-
-def choose_form(model: StateSpace) -> Literal["innovation", "information", "loop"]:
-    """Choose the cheapest exact form of a model.
-
-    Args:
-        model: the state-space model.
-
-    Returns:
-        "loop" unless the transition is a :class:`MeanNetwork` with a constant Q; otherwise
-        "information" where R is diagonal and obs exceeds state, else "innovation".
-
-    Example:
-        >>> import torch
-        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
-        >>> eye, H = torch.eye(2), torch.zeros(9, 2)
-        >>> model = StateSpace(f, eye, H, torch.ones(9), torch.zeros(9, 1), torch.zeros(9),
-        ...                    torch.zeros(2), eye)
-        >>> choose_form(model), choose_form(model._replace(emission_cov=torch.eye(9)))
-        ('information', 'innovation')
-    """
-    if not isinstance(model.transition_cov, Tensor) or not isinstance(
-        model.transition, MeanNetwork
-    ):
-        return "loop"
-    obs, state = model.emission_matrix.shape
-    return "information" if model.emission_cov.ndim == 1 and obs > state else "innovation"
-
-
-def _checked_form(model: StateSpace, form: Form) -> str:
-    best = choose_form(model)
-    if form == "auto":
-        return best
-    if form not in ("innovation", "information", "loop"):
-        raise ValueError(
-            f"`form` must be 'auto', 'innovation', 'information' or 'loop', got {form!r}."
-        )
-    if best == "loop" and form != "loop":
-        raise ValueError(
-            f"`form` {form!r} needs a MeanNetwork transition with a constant transition_cov; "
-            "this model has a transition or covariance of another kind: use form='loop'."
-        )
-    if form == "information" and model.emission_cov.ndim != 1:
-        raise ValueError(
-            "`form` 'information' needs a diagonal emission covariance (variances of shape (obs,)),"
-            f" got a full one of shape {tuple(model.emission_cov.shape)}: use form='innovation'."
-        )
-    return form
-
-
-def _initial(model: StateSpace, reset: Tensor, mean: Tensor, cov: Tensor) -> Belief:
-    """Put the initial belief where an episode starts. reset: (*batch, 1)."""
-    return Belief(
-        torch.where(reset, model.initial_mean, mean),
-        torch.where(reset.unsqueeze(-1), model.initial_cov, cov),
-    )
-
-
-def predict_step(
-    model: StateSpace, mean: Tensor, previous_action: Tensor, reset: Tensor
-) -> Belief:
-    r"""Predict one step, or start an episode from the initial belief.
-
-    .. math:: m^- = f(m, a), \; P^- = Q; \qquad \text{at a reset } m^- = m_0, \; P^- = P_0
-
-    Eq. (8) [DRBPN].
-
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before, shape ``(*batch, state)``.
-        previous_action: shape ``(*batch, action)``.
-        reset: bool, shape ``(*batch,)``.
-
-    Returns:
-        The predicted belief.
-
-    Example:
-        >>> import torch
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(
-        ...     lambda m, a: m + 1, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...     torch.zeros(2), eye)
-        >>> reset = torch.tensor([True, False])
-        >>> predict_step(model, torch.ones(2, 2), torch.zeros(2, 1), reset).mean.tolist()
-        [[0.0, 0.0], [2.0, 2.0]]
-    """
-    cov = model.transition_cov
-    if not isinstance(cov, Tensor):
-        cov = cov(mean, previous_action)
-    return _initial(model, reset.unsqueeze(-1), model.transition(mean, previous_action), cov)
 
 
 def filter_step(
@@ -243,7 +100,7 @@ def filter_step(
     """
     predicted = predict_step(model, mean, previous_action, reset)
     H, offset = model.emission_matrix, model.offset(previous_action)
-    if _checked_form(model, form) == "loop":
+    if checked_form(model, form) == "loop":
         R = model.full_emission_cov()
         filtered = update(predicted, observation, observed, H, R, offset)
         ll = log_likelihood(predicted, observation, observed, H, R, offset)
@@ -253,7 +110,7 @@ def filter_step(
     m = predicted.mean
     residual = zero_missing(zero_missing(observation, observed) - (offset + m @ H.mT), observed)
     row = reset.unsqueeze(-1)
-    if _checked_form(model, form) == "information":
+    if checked_form(model, form) == "information":
         weight = observed / model.emission_cov
         precision, log_det_prior = _precision(model, weight, row)
         factor = torch.linalg.cholesky(precision)
@@ -262,8 +119,7 @@ def filter_step(
         log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + log_det_prior
         ll = _information_likelihood(model, step, residual, weight, observed, log_det, row)
     else:
-        Q = model.transition_cov
-        assert isinstance(Q, Tensor)  # noqa: S101 - narrowed by choose_form, for the type checker
+        Q = constant_cov(model)
         R = model.full_emission_cov()
         cross, initial_cross = Q @ H.mT, model.initial_cov @ H.mT
         S = torch.where(row.unsqueeze(-1), H @ initial_cross + R, H @ cross + R)
@@ -306,13 +162,8 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
         >>> filtered_cov(model, seen, torch.tensor(False)).tolist()
         [[0.75, 0.0], [0.0, 1.0]]
     """
-    if not isinstance(model.transition_cov, Tensor):
-        raise ValueError(
-            "`transition_cov` depends on the state here, so the covariance depends on the whole "
-            "past: ask filter_sequence or filter_step for it with return_cov=True."
-        )
     zeros = torch.zeros_like(model.initial_mean).expand(*reset.shape, -1)
-    prior = _initial(model, reset.unsqueeze(-1), zeros, model.transition_cov)
+    prior = initial_belief(model, reset.unsqueeze(-1), zeros, constant_cov(model))
     nothing = torch.zeros((), dtype=zeros.dtype, device=zeros.device).expand(observed.shape)
     H, R = model.emission_matrix, model.full_emission_cov()
     return update(prior, nothing, observed, H, R).cov
@@ -370,7 +221,7 @@ def filter_sequence(
         >>> out.mean.shape, out.log_likelihood.shape
         (torch.Size([4, 10, 2]), torch.Size([4, 10]))
     """
-    chosen = _checked_form(model, form)
+    chosen = checked_form(model, form)
     batch, time = reset.shape[:-1], reset.shape[-1]
     mean = mean.expand(*batch, mean.shape[-1])
 
@@ -382,7 +233,9 @@ def filter_sequence(
         return x.transpose(0, 1).reshape(*batch, time, *x.shape[2:])
 
     # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
-    x, a, seen = (time_major(v) for v in (zero_missing(observation, observed), previous_action, observed))
+    x, a, seen = (
+        time_major(v) for v in (zero_missing(observation, observed), previous_action, observed)
+    )
     first = time_major(reset.unsqueeze(-1))
     again = None if restart is None else time_major(restart.unsqueeze(-1))
     stored = None if restart_mean is None else time_major(restart_mean)
@@ -429,7 +282,7 @@ def _loop(
 def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, list[Tensor]]:
     """Split the first layer: its action part for all steps at once, its weights on the mean."""
     f = model.transition
-    assert isinstance(f, MeanNetwork)  # noqa: S101 - narrowed by choose_form, for the type checker
+    assert isinstance(f, MeanNetwork)  # choose_form saw to it; for the type checker
     state = model.emission_matrix.shape[-1]
     drive = torch.nn.functional.linear(action, f.weights[0][:, state:], f.biases[0])
     rest = [p for pair in zip(f.weights[1:], f.biases[1:], strict=True) for p in pair]
@@ -447,11 +300,10 @@ def _innovation(
     stored: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     f, drive, weights = _network(model, action)
-    H, Q, R = model.emission_matrix, model.transition_cov, model.full_emission_cov()
-    assert isinstance(Q, Tensor)  # noqa: S101 - narrowed by choose_form, for the type checker
+    H, Q, R = model.emission_matrix, constant_cov(model), model.full_emission_cov()
     cross, initial_cross = Q @ H.mT, model.initial_cov @ H.mT
     y = zero_missing(observation - model.offset(action), observed)
-    _, mean, ll = InnovationRecurrence.apply(
+    _, mean, ll = InnovationRecurrence.apply(  # type: ignore[no-untyped-call]
         f.residual, f.activation, y, observed, reset, restart, stored, start, drive,
         model.initial_mean, H, H @ cross + R, H @ initial_cross + R, cross, initial_cross, *weights,
     )  # fmt: skip
@@ -469,9 +321,7 @@ def _precision(model: StateSpace, weight: Tensor, reset: Tensor) -> tuple[Tensor
 
 def _prior_precision(model: StateSpace) -> tuple[Tensor, Tensor]:
     """Return the inverses and log-determinants of (Q, P_0): two small matrices a call."""
-    Q = model.transition_cov
-    assert isinstance(Q, Tensor)  # noqa: S101 - narrowed by choose_form, for the type checker
-    factor = torch.linalg.cholesky(torch.stack([Q, model.initial_cov]))
+    factor = torch.linalg.cholesky(torch.stack([constant_cov(model), model.initial_cov]))
     log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return torch.cholesky_inverse(factor), log_det
 
@@ -481,7 +331,7 @@ def _gathered(model: StateSpace, weight: Tensor) -> Tensor:
     H = model.emission_matrix
     state = H.shape[-1]
     outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
-    return (weight @ outer).unflatten(-1, (state, state))
+    return (weight @ outer).view(*weight.shape[:-1], state, state)
 
 
 def _information_likelihood(
@@ -527,7 +377,7 @@ def _information(
     gathered = _gathered(model, weight)
     prior, log_det_prior = _prior_precision(model)
     precision = gathered + torch.where(reset.unsqueeze(-1), prior[1], prior[0])
-    m, mean, log_det = InformationRecurrence.apply(
+    m, mean, log_det = InformationRecurrence.apply(  # type: ignore[no-untyped-call]
         f.residual, f.activation, precision, gathered, (weight * y) @ H, reset, restart, stored,
         start, drive, model.initial_mean, *weights,
     )  # fmt: skip

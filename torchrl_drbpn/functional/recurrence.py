@@ -22,6 +22,9 @@ __all__ = ["ACTIVATIONS", "InformationRecurrence", "InnovationRecurrence", "Mean
 
 ACTIVATIONS = ("relu", "tanh")
 
+_relu_backward = torch.ops.aten.threshold_backward.default
+_tanh_backward = torch.ops.aten.tanh_backward.default
+
 
 class MeanNetwork(NamedTuple):
     r"""Describe the transition mean f(mean, action) as plain tensors.
@@ -103,8 +106,8 @@ class _Steps:
         for weight, h in zip(reversed(self.weights), reversed(hidden), strict=True):
             grads.append(x)
             x = x @ weight
-            # relu'(.) and tanh'(.) from the stored output.
-            x = torch.where(h > 0, x, 0.0) if self.relu else x * (1 - h * h)
+            # relu' and tanh' from the stored output, each in one operation.
+            x = _relu_backward(x, h, 0) if self.relu else _tanh_backward(x, h)
         grads.append(x)
         back = torch.addmm(grad, x, self.first) if self.residual else x @ self.first
         return back, grads[::-1]
@@ -216,7 +219,9 @@ def _run_back(
             # innovation v = y - H m enters the mean through the gain and the likelihood directly
             ge = torch.baddbmm(errors[t].unsqueeze(2), gains[t], g.unsqueeze(2)).squeeze(2)
             g_error.append(ge)
-            g = torch.addmm(g if predicted_outer is None else g + predicted_outer[t], ge, emission, alpha=-1)
+            g = torch.addmm(
+                g if predicted_outer is None else g + predicted_outer[t], ge, emission, alpha=-1
+            )
         else:
             base = g if predicted_outer is None else g + predicted_outer[t]
             g = torch.baddbmm(base.unsqueeze(1), g.unsqueeze(1), gains[t], alpha=-1).squeeze(1)
@@ -262,6 +267,7 @@ class InnovationRecurrence(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """Return predicted mean, filtered mean and log-likelihood (without its 2 pi term)."""
         (residual, activation, y, observed, reset, restart, restart_mean, start, drive) = args[:9]
         initial_mean, H, cov, initial_cov, cross, initial_cross, first, *rest = args[9:]
         steps = _Steps(residual, activation, first, tuple(rest))
@@ -276,21 +282,24 @@ class InnovationRecurrence(torch.autograd.Function):
         flat = inverse.reshape(time * batch * obs, obs)
         shape = (time, batch, obs, state)
         gain = torch.where(
-            reset.unsqueeze(-1), (flat @ initial_cross.t()).view(shape), (flat @ cross.t()).view(shape)
+            reset.unsqueeze(-1),
+            (flat @ initial_cross.t()).view(shape),
+            (flat @ cross.t()).view(shape),
         )
 
         predicted, filtered, inputs, hidden = _run(
             steps, drive, start, reset, initial_mean, restart, restart_mean, gain, y, H
         )
         m, mean = torch.stack(predicted), torch.stack(filtered)
-        r = torch.where(observed, torch.addmm(y.flatten(0, 1), m.flatten(0, 1), H.t(), alpha=-1).view_as(y), 0.0)
+        r = torch.where(
+            observed, torch.addmm(y.flatten(0, 1), m.flatten(0, 1), H.t(), alpha=-1).view_as(y), 0.0
+        )
         z = (inverse @ r.unsqueeze(-1)).squeeze(-1)
         ll = -0.5 * ((z * r).sum(-1) + log_det)
 
         layers = [torch.stack([h[i] for h in hidden]) for i in range(len(hidden[0]))]
         ctx.save_for_backward(
-            reset, restart, inverse, gain, z, m, torch.stack(inputs), H, cross, initial_cross,
-            first, *rest, *layers,
+            reset, restart, inverse, gain, z, m, torch.stack(inputs), H, first, *rest, *layers,
         )  # fmt: skip
         ctx.network = (residual, activation, len(rest))
         ctx.set_materialize_grads(False)
@@ -301,13 +310,12 @@ class InnovationRecurrence(torch.autograd.Function):
     def backward(
         ctx: Any, g_m: Tensor | None, g_mean: Tensor | None, g_ll: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        (reset, restart, inverse, gain, z, m, inputs, H, cross, initial_cross, first) = (
-            ctx.saved_tensors[:11]
-        )
+        """Return the gradient of every input of ``forward``, in its order."""
+        reset, restart, inverse, gain, z, m, inputs, H, first = ctx.saved_tensors[:9]
         residual, activation, count = ctx.network
-        rest, layers = ctx.saved_tensors[11 : 11 + count], ctx.saved_tensors[11 + count :]
+        rest, layers = ctx.saved_tensors[9 : 9 + count], ctx.saved_tensors[9 + count :]
         steps = _Steps(residual, activation, first, rest)
-        obs, state = z.shape[-1], m.shape[-1]
+        obs = z.shape[-1]
 
         g_mean = torch.zeros_like(m) if g_mean is None else g_mean
         g_ll = torch.zeros_like(m[..., 0]) if g_ll is None else g_ll
@@ -336,7 +344,9 @@ class InnovationRecurrence(torch.autograd.Function):
         g_restart = None
         if restart is not None:
             g_restart = torch.where(restart, back.inputs.view_as(m), 0.0)
-        weights = steps.weight_grads(inputs.flatten(0, 1), [h.flatten(0, 1) for h in layers], back.layers)
+        weights = steps.weight_grads(
+            inputs.flatten(0, 1), [h.flatten(0, 1) for h in layers], back.layers
+        )
         return (
             None, None, g_e.view_as(z), None, None, None, g_restart, back.start,
             back.layers[0].view(*m.shape[:2], -1), g_initial_mean, -(g_e.t() @ mf),
@@ -349,6 +359,7 @@ class InformationRecurrence(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """Return predicted mean, filtered mean and log|precision|."""
         (residual, activation, precision, gathered, evidence) = args[:5]
         reset, restart, restart_mean, start, drive, initial_mean, first, *rest = args[5:]
         steps = _Steps(residual, activation, first, tuple(rest))
@@ -372,6 +383,7 @@ class InformationRecurrence(torch.autograd.Function):
     def backward(
         ctx: Any, g_m: Tensor | None, g_mean: Tensor | None, g_log_det: Tensor | None
     ) -> tuple[Tensor | None, ...]:
+        """Return the gradient of every input of ``forward``, in its order."""
         reset, restart, C, D, m, mean, inputs, first = ctx.saved_tensors[:8]
         residual, activation, count = ctx.network
         rest, layers = ctx.saved_tensors[8 : 8 + count], ctx.saved_tensors[8 + count :]
@@ -389,7 +401,9 @@ class InformationRecurrence(torch.autograd.Function):
         g_restart = None
         if restart is not None:
             g_restart = torch.where(restart, back.inputs.view_as(m), 0.0)
-        weights = steps.weight_grads(inputs.flatten(0, 1), [h.flatten(0, 1) for h in layers], back.layers)
+        weights = steps.weight_grads(
+            inputs.flatten(0, 1), [h.flatten(0, 1) for h in layers], back.layers
+        )
         return (
             None, None, g_precision, g_gathered, p.squeeze(-1), None, None, g_restart, back.start,
             back.layers[0].view(*m.shape[:2], -1), g_initial_mean, *weights,

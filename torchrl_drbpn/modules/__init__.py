@@ -1,4 +1,4 @@
-"""Parameters and keys: the learned state-space model and the belief filter as a TensorDictModule."""
+"""The learned state-space model, the belief filter, and its TensorDictModule."""
 
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule

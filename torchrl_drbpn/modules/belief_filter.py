@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from torchrl_drbpn.functional import (
     Belief,
     FilterOutput,
+    Form,
+    MeanNetwork,
     StateSpace,
     filter_sequence,
     filter_step,
     predict_step,
 )
-from torchrl_drbpn.functional.filtering import Form
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
@@ -130,17 +133,13 @@ class BeliefFilter(nn.Module):
     def state_space(self) -> StateSpace:
         """Return the model's tensors, built from the parameters (differentiable)."""
         transition = self.transition
+        mean: MeanNetwork | Callable[[Tensor, Tensor], Tensor]
+        cov: Tensor | Callable[[Tensor, Tensor], Tensor]
         if isinstance(transition, GaussianTransition):
             mean = transition.mean_network()
             cov = transition.cov() if transition.constant_cov else transition.cov
         else:
-
-            def mean(m: Tensor, a: Tensor) -> Tensor:  # type: ignore[misc]
-                return transition(m, a)[0]
-
-            def cov(m: Tensor, a: Tensor) -> Tensor:
-                return transition(m, a)[1]
-
+            mean, cov = lambda m, a: transition(m, a)[0], lambda m, a: transition(m, a)[1]
         emission = self.emission
         return StateSpace(
             mean,

@@ -94,7 +94,7 @@ class BeliefFilterModule(TensorDictModuleBase):
 
     def __init__(
         self,
-        filter: BeliefFilter,  # noqa: A002 - the contract's name
+        filter: BeliefFilter,
         *,
         in_keys: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None = None,
@@ -174,7 +174,7 @@ class BeliefFilterModule(TensorDictModuleBase):
         if value is not None:
             return value
         sources = {
-            1: "ObservationMissingness or ObservedFromNaN writes it (all True if nothing is missing)",
+            1: "ObservationMissingness or ObservedFromNaN writes it (all True: nothing missing)",
             2: "the PreviousAction transform writes it",
             3: "TorchRL's InitTracker transform writes it",
         }

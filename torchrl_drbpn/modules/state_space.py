@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -39,6 +40,11 @@ def _check_std(init_std: float, min_std: float) -> None:
 def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}.")
+
+
+def _linear(layers: Iterable[nn.Module]) -> list[tuple[Tensor, Tensor]]:
+    """Return (weight, bias) of each linear layer."""
+    return [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
 
 
 class _Covariance(nn.Module):
@@ -156,8 +162,7 @@ class GaussianTransition(nn.Module):
         def network(out_features: int) -> nn.ModuleList:
             sizes = [state_dim + action_dim, *hidden_sizes, out_features]
             return nn.ModuleList(
-                nn.Linear(i, o, device=device, dtype=dtype)
-                for i, o in zip(sizes[:-1], sizes[1:], strict=True)
+                nn.Linear(i, o, device=device, dtype=dtype) for i, o in pairwise(sizes)
             )
 
         self.layers = network(state_dim)
@@ -168,20 +173,16 @@ class GaussianTransition(nn.Module):
             with torch.no_grad():
                 # Start from the constant init_std: the last layer begins with the bias alone.
                 start = _Covariance(state_dim, cov, init_std, min_std, device, dtype).raw
-                last = self.cov_layers[-1]
-                last.weight.zero_()
-                last.bias.copy_(start.flatten())
+                weight, bias = _linear(self.cov_layers[-1:])[-1]
+                weight.zero_()
+                bias.copy_(start.flatten())
         else:
             self.noise = _Covariance(state_dim, cov, init_std, min_std, device, dtype)
 
     def mean_network(self) -> MeanNetwork:
         """Return f as tensors, as the fast filter wants it."""
-        return MeanNetwork(
-            tuple(layer.weight for layer in self.layers),
-            tuple(layer.bias for layer in self.layers),
-            self.residual,
-            self.activation,
-        )
+        weights, biases = zip(*_linear(self.layers), strict=True)
+        return MeanNetwork(weights, biases, self.residual, self.activation)
 
     @property
     def constant_cov(self) -> bool:
@@ -205,15 +206,11 @@ class GaussianTransition(nn.Module):
             return self.noise()
         if mean is None or action is None or self.cov_layers is None:
             raise ValueError("`mean` and `action` are needed: this Q is a network of both.")
-        raw = MeanNetwork(
-            tuple(layer.weight for layer in self.cov_layers),
-            tuple(layer.bias for layer in self.cov_layers),
-            False,
-            self.activation,
-        )(mean, action)
+        weights, biases = zip(*_linear(self.cov_layers), strict=True)
+        raw = MeanNetwork(weights, biases, False, self.activation)(mean, action)
         if self.cov_kind == "diag":
             return torch.diag_embed(positive_std(raw, self.min_std).square())
-        return full_cov(raw.unflatten(-1, (self.state_dim, self.state_dim)), self.min_std)
+        return full_cov(raw.view(*raw.shape[:-1], self.state_dim, self.state_dim), self.min_std)
 
     def forward(self, mean: Tensor, action: Tensor) -> Belief:
         """Return the predicted belief.

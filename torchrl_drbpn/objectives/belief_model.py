@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -62,7 +62,7 @@ class BeliefModelLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys: list[NestedKey] = ["loss_model", "log_likelihood"]
+    out_keys: ClassVar[list[NestedKey]] = ["loss_model", "log_likelihood"]
 
     def __init__(
         self,
@@ -95,7 +95,10 @@ class BeliefModelLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_model`` and, detached, ``log_likelihood`` per observed entry (nats)."""
         keys = self.tensor_keys
-        ll, observed = tensordict.get(keys.log_likelihood, None), tensordict.get(keys.observed, None)
+        ll, observed = (
+            tensordict.get(keys.log_likelihood, None),
+            tensordict.get(keys.observed, None),
+        )
         if ll is None or observed is None:
             absent = keys.log_likelihood if ll is None else keys.observed
             raise KeyError(

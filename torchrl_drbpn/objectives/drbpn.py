@@ -194,9 +194,7 @@ class DRBPNLoss(LossModule):
                 "rollout first (TorchRL's GAE), then cut it into minibatches."
             )
         data = tensordict.copy()
-        with self.filter_network_params.to_module(
-            self.filter_network, preserve_module_state=False
-        ):
+        with self.filter_network_params.to_module(self.filter_network, preserve_module_state=False):
             self.filter_network(data)
             if self.model_loss is not None:
                 self._add_last_observations(data)
@@ -222,12 +220,15 @@ class DRBPNLoss(LossModule):
         log_likelihood = data.get(keys.log_likelihood)
         if following is None or data.get(keys.next_observed, None) is None:
             return
-        where = last_steps(
-            data, done=keys.done, final=keys.final, like=log_likelihood
-        ).nonzero(as_tuple=True)
+        where = last_steps(data, done=keys.done, final=keys.final, like=log_likelihood).nonzero(
+            as_tuple=True
+        )
         gathered = following[where]
         # A collector writes next.is_init = False; a belief that goes on is what is wanted here.
-        gathered.set(keys.is_init, torch.zeros(*gathered.shape, 1, dtype=torch.bool, device=log_likelihood.device))
+        gathered.set(
+            keys.is_init,
+            torch.zeros(*gathered.shape, 1, dtype=torch.bool, device=log_likelihood.device),
+        )
         with set_recurrent_mode(False):
             self.filter_network(gathered)
         data.set(

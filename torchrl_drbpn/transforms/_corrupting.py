@@ -281,7 +281,7 @@ class CorruptingTransform(OrderedTransform):
         # the first observation of an episode arrives through the same sensors as every other
         return self._run(tensordict_reset, None)
 
-    @dispatch(source="in_keys", dest="out_keys")  # type: ignore[untyped-decorator]
+    @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the transform to data outside an environment, as on a replay buffer.
 

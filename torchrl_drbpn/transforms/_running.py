@@ -7,41 +7,13 @@ import math
 from typing import Any, Self, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_drbpn.functional.statistics import Moments, masked_moments, merge_moments, variance
 from torchrl_drbpn.transforms._common import OrderedTransform
 
-__all__ = ["RunningMoments", "RunningScaleTransform", "flagged_rows", "spread_rows"]
-
-
-def flagged_rows(tensordict: TensorDictBase, name: str, key: NestedKey) -> Tensor | None:
-    """Return the rows that a flag such as `"_reset"` marks for the entry `key`.
-
-    Args:
-        tensordict: where the flag is looked for, beside `key` first, then in the folders above it.
-        name: `"_reset"` or `"_step"`.
-        key: the entry that is about to be written.
-
-    Returns:
-        A bool tensor of the batch shape, or None where there is no flag: every row is meant.
-    """
-    folders = key[:-1] if isinstance(key, tuple) else ()
-    for depth in range(len(folders), -1, -1):
-        flag_key = (*folders[:depth], name) if depth else name
-        flag = tensordict.get(flag_key, None)
-        if flag is not None:
-            batch_dims = tensordict.ndim
-            if flag.ndim > batch_dims:
-                flag = flag.flatten(batch_dims).any(-1)
-            return cast(Tensor, flag)
-    return None
-
-
-def spread_rows(rows: Tensor, value: Tensor) -> Tensor:
-    """Expand row flags of shape `(*batch,)` over a value of shape `(*batch, *event)`."""
-    return rows.reshape(*rows.shape, *(1,) * (value.ndim - rows.ndim)).expand_as(value)
+__all__ = ["RunningMoments", "RunningScaleTransform"]
 
 
 class RunningMoments(nn.Module):

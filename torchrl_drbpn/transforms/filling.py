@@ -10,6 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
+from torchrl_drbpn.transforms._carried import flagged_rows, spread_rows
 from torchrl_drbpn.transforms._common import (
     OrderedTransform,
     Role,
@@ -19,7 +20,6 @@ from torchrl_drbpn.transforms._common import (
     read,
     unbounded_like,
 )
-from torchrl_drbpn.transforms._running import flagged_rows, spread_rows
 
 __all__ = ["FillLastObserved"]
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, Transform
 
+from torchrl_drbpn.transforms._carried import flagged_rows, spread_rows
 from torchrl_drbpn.transforms._common import (
     Role,
     as_key_list,
@@ -20,12 +21,7 @@ from torchrl_drbpn.transforms._common import (
     transform_chain,
     unbounded_like,
 )
-from torchrl_drbpn.transforms._running import (
-    RunningMoments,
-    RunningScaleTransform,
-    flagged_rows,
-    spread_rows,
-)
+from torchrl_drbpn.transforms._running import RunningMoments, RunningScaleTransform
 
 __all__ = ["MaskedObservationNorm"]
 

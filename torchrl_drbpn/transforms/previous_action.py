@@ -7,17 +7,15 @@ from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase, Transform
 
-from torchrl_drbpn.transforms._common import OrderedTransform, Role, as_key_list, pair_keys, read
-from torchrl_drbpn.transforms._running import flagged_rows, spread_rows
+from torchrl_drbpn.transforms._carried import CarriedTransform, clear_rows
+from torchrl_drbpn.transforms._common import Role, as_key_list, pair_keys, read
 
 __all__ = ["PreviousAction"]
 
 
-class PreviousAction(OrderedTransform):
+class PreviousAction(CarriedTransform):
     r"""Write the action of step t beside the observation of step t + 1, zeros after a reset.
 
     `("next", "previous_action")` at t is `action` at t, and `previous_action` is zero in the first
@@ -55,7 +53,6 @@ class PreviousAction(OrderedTransform):
         inputs = as_key_list(in_keys)
         outputs = pair_keys(inputs, out_keys, name="out_keys", default="previous_action")
         super().__init__(in_keys=inputs, out_keys=outputs)
-        self._layouts: dict[NestedKey, tuple[torch.Size, torch.dtype]] = {}
         # What travels from the way in to the way out, where earlier action transforms have
         # overwritten the action: one private entry per action, never seen outside a step.
         self._chosen = [
@@ -87,44 +84,11 @@ class PreviousAction(OrderedTransform):
             tensordict_reset.set(out_key, self._zero(key, tensordict_reset))
         return tensordict_reset
 
-    def _zero(self, key: NestedKey, tensordict_reset: TensorDictBase) -> Tensor:
-        # Specs are slow to ask and short episodes reset often: only the first reset asks.
-        layout = self._layouts.get(key)
-        if layout is None:
-            if self.parent is None:
-                return torch.zeros_like(read(tensordict_reset, key, self))
-            spec = self._action_spec(key)
-            event_shape = spec.shape[len(self.parent.batch_size) :]
-            layout = self._layouts[key] = (event_shape, spec.dtype)
-        event_shape, dtype = layout
-        shape = (*tensordict_reset.batch_size, *event_shape)
-        return torch.zeros(shape, dtype=dtype, device=self.parent.device)
-
-    def empty_cache(self) -> None:
-        """Forget what was read from the specs."""
-        super().empty_cache()
-        self._layouts = {}
-
-    def set_container(self, container: Transform | EnvBase) -> None:
-        """Attach the transform.
-
-        Args:
-            container: the environment or the `Compose` that takes the transform.
-        """
-        super().set_container(container)
-        self._layouts = {}
-
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         for out_key in self.out_keys:
-            rows = flagged_rows(tensordict, "_reset", out_key)
-            previous = tensordict_reset.get(out_key, None)
-            if rows is not None and previous is not None:
-                kept = torch.where(
-                    spread_rows(rows, previous), torch.zeros_like(previous), previous
-                )
-                tensordict_reset.set(out_key, kept)
+            clear_rows(tensordict, tensordict_reset, out_key)
         return tensordict_reset
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -151,10 +115,10 @@ class PreviousAction(OrderedTransform):
             The spec after it.
         """
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            observation_spec[out_key] = self._action_spec(key)
+            observation_spec[out_key] = self._carried_leaf(key)
         return observation_spec
 
-    def _action_spec(self, key: NestedKey) -> TensorSpec:
+    def _carried_leaf(self, key: NestedKey) -> TensorSpec:
         spec = self.parent.full_action_spec
         if key not in spec.keys(True, True):
             raise KeyError(

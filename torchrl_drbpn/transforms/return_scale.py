@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from torchrl_drbpn.transforms._common import Role, as_key_list, pair_keys, read, unbounded_like
-from torchrl_drbpn.transforms._running import (
-    RunningMoments,
-    RunningScaleTransform,
+from torchrl_drbpn.transforms._carried import (
+    CarriedTransform,
+    clear_rows,
     flagged_rows,
     spread_rows,
 )
+from torchrl_drbpn.transforms._common import Role, as_key_list, pair_keys, read, unbounded_like
+from torchrl_drbpn.transforms._running import RunningMoments, RunningScaleTransform
 
 __all__ = ["RunningReturnScale"]
 
 
-class RunningReturnScale(RunningScaleTransform):
+class RunningReturnScale(CarriedTransform, RunningScaleTransform):
     r"""Divide the reward by the running standard deviation of the discounted return.
 
     With R_t = gamma R_{t-1} + r_t, R = 0 at the start of an episode, and var the population
@@ -126,30 +126,18 @@ class RunningReturnScale(RunningScaleTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        del tensordict
         self._check_collector()
         # Every row: the environment keeps the old values of the rows that are not reset.
         for key, state_key in zip(self.in_keys, self.state_keys, strict=True):
-            previous = tensordict.get(state_key, None)
-            if previous is not None:
-                zero = torch.zeros_like(previous)
-            elif self.parent is not None:
-                zero = self.parent.full_reward_spec[key].zero()
-            else:
-                zero = torch.zeros_like(read(tensordict_reset, key, self))
-            tensordict_reset.set(state_key, zero)
+            tensordict_reset.set(state_key, self._zero(key, tensordict_reset))
         return tensordict_reset
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         for state_key in self.state_keys:
-            rows = flagged_rows(tensordict, "_reset", state_key)
-            previous = tensordict_reset.get(state_key, None)
-            if rows is not None and previous is not None:
-                kept = torch.where(
-                    spread_rows(rows, previous), torch.zeros_like(previous), previous
-                )
-                tensordict_reset.set(state_key, kept)
+            clear_rows(tensordict, tensordict_reset, state_key)
         return tensordict_reset
 
     def _scale(self, tensordict: TensorDictBase) -> None:
@@ -201,10 +189,12 @@ class RunningReturnScale(RunningScaleTransform):
         return self._with_state(state_spec)
 
     def _with_state(self, spec: Composite) -> Composite:
-        rewards = self.parent.full_reward_spec
         for key, state_key in zip(self.in_keys, self.state_keys, strict=True):
-            spec[state_key] = unbounded_like(self._reward_leaf(rewards, key))
+            spec[state_key] = self._carried_leaf(key)
         return spec
+
+    def _carried_leaf(self, key: NestedKey) -> TensorSpec:
+        return unbounded_like(self._reward_leaf(self.parent.full_reward_spec, key))
 
     def _reward_leaf(self, reward_spec: Composite, key: NestedKey) -> TensorSpec:
         if key not in reward_spec.keys(True, True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -21,9 +21,9 @@ def build(
     *,
     obs_dim: int,
     action_dim: int,
-    normalize: str,
+    normalize: Literal["entry", "step"],
     state_dim: int | None,
-    policy_input: str,
+    policy_input: Literal["mean", "mean_cov"],
     transition: Mapping[str, Any],
     emission: Mapping[str, Any],
     initial: Mapping[str, Any],
@@ -64,6 +64,4 @@ def build(
         return {"emission_noise_std": std.mean().item()}
 
     covariance = state * (state + 1) // 2 if policy_input == "mean_cov" else 0
-    return Belief(
-        module, state + covariance, BeliefModelLoss(normalize=normalize), summary=summary
-    )
+    return Belief(module, state + covariance, BeliefModelLoss(normalize=normalize), summary=summary)

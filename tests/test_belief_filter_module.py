@@ -1,0 +1,344 @@
+"""What `BeliefFilterModule` is held to: the duties of a belief module, its own keys, bad input."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from contracts import ACTION, OBS, BeliefModuleContract
+from tensordict import TensorDict, TensorDictBase
+from torchrl.modules import set_recurrent_mode
+
+from torchrl_drbpn import BeliefFilter, BeliefFilterModule, GaussianTransition, functional
+
+OPTIONAL = (
+    ("belief", "cov"),
+    ("belief", "observation"),
+    ("belief", "predicted_observation"),
+    ("belief", "innovation_cov"),
+)
+
+
+def make_filter(
+    obs: int = OBS,
+    action: int = ACTION,
+    dtype: torch.dtype | None = None,
+    state: int | None = None,
+    cov_network: bool = False,
+    **kwargs: Any,
+) -> BeliefFilter:
+    """A filter whose parameters are all away from their starting values."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        if cov_network:
+            kwargs["transition"] = GaussianTransition(
+                state, action, hidden_sizes=(8,), cov="full", cov_network=True, dtype=dtype
+            )
+        belief = BeliefFilter(obs, action, state, dtype=dtype, **kwargs)
+        with torch.no_grad():
+            for parameter in belief.parameters():
+                parameter += 0.1 * torch.randn_like(parameter)
+    return belief
+
+
+def make_frames(
+    shape: tuple[int, ...], obs: int = OBS, dtype: torch.dtype = torch.float64, seed: int = 0
+) -> TensorDict:
+    """What an environment writes; nowhere an episode start."""
+    g = torch.Generator().manual_seed(seed)
+    observed = torch.rand(*shape, obs, generator=g) < 0.6
+    observation = torch.randn(*shape, obs, generator=g, dtype=dtype)
+    return TensorDict(
+        {
+            "observation": torch.where(observed, observation, 0.0),
+            "observed": observed,
+            "previous_action": torch.randn(*shape, ACTION, generator=g, dtype=dtype),
+            "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
+        },
+        shape,
+    )
+
+
+def with_state(frames: TensorDict, state: int) -> TensorDict:
+    """`frames` with a recurrent state in mid-episode."""
+    g = torch.Generator().manual_seed(9)
+    shape, dtype = frames.shape, frames["observation"].dtype
+    mean = torch.randn(*shape, state, generator=g, dtype=dtype)
+    age = torch.full((*shape, 1), 3)
+    return frames.clone().set("recurrent", TensorDict({"mean": mean, "age": age}, shape))
+
+
+# ------------------------------------------------------------------------------------------- duties
+class TestContract(BeliefModuleContract):
+    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
+        return BeliefFilterModule(make_filter(obs, action, dtype), **kwargs)
+
+    def differentiable(self, out: TensorDictBase) -> torch.Tensor:
+        return out["features"].square().mean() - out["belief", "log_likelihood"].mean()
+
+
+class TestContractOfTheInformationForm(TestContract):
+    """State smaller than obs; the covariance in the features."""
+
+    test_it_runs_in_batched_environments = None  # once is enough
+
+    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
+        belief = make_filter(obs, action, dtype, state=3)
+        return BeliefFilterModule(belief, policy_input="mean_cov", **kwargs)
+
+
+class TestContractOfANetworkCovariance(TestContract):
+    """Q depends on the state: the filter runs step by step."""
+
+    test_it_runs_in_batched_environments = None  # once is enough
+
+    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
+        belief = make_filter(obs, action, dtype, state=3, cov_network=True)
+        return BeliefFilterModule(belief, **kwargs)
+
+
+# ---------------------------------------------------------------------------------- keys of its own
+def test_the_keys_are_those_of_the_contract():
+    module = BeliefFilterModule(make_filter())
+    assert module.in_keys == [
+        "observation",
+        "observed",
+        "previous_action",
+        "is_init",
+        ("recurrent", "mean"),
+        ("recurrent", "age"),
+    ]
+    assert module.out_keys == [
+        "features",
+        ("belief", "mean"),
+        ("belief", "log_likelihood"),
+        ("next", "recurrent", "mean"),
+        ("next", "recurrent", "age"),
+    ]
+
+
+def test_a_list_of_four_or_six_in_keys_renames_by_position():
+    four = ["a", ("b", "c"), "d", "e"]
+    module = BeliefFilterModule(make_filter(), in_keys=four)
+    assert module.in_keys == [*four, ("recurrent", "mean"), ("recurrent", "age")]
+    module = BeliefFilterModule(make_filter(), in_keys=[*four, "f", ("g", "h")])
+    assert module.in_keys == [*four, "f", ("g", "h")]
+    assert module.out_keys[-2:] == [("next", "f"), ("next", "g", "h")]
+    assert set(module.make_tensordict_primer().primers.keys(True, True)) == {"f", ("g", "h")}
+
+
+def test_the_recurrent_state_can_be_renamed_and_carries_the_belief():
+    names = {("recurrent", "mean"): ("agent", "hidden"), ("recurrent", "age"): "count"}
+    plain = BeliefFilterModule(make_filter(dtype=torch.float64))
+    named = BeliefFilterModule(make_filter(dtype=torch.float64), in_keys=names)
+    data = with_state(make_frames((3,)), OBS)
+    expected = plain(data.clone())
+    for old, new in names.items():
+        data.rename_key_(old, new)
+    received = named(data)
+    assert torch.equal(received["features"], expected["features"])
+    assert torch.equal(received["next", "agent", "hidden"], expected["next", "recurrent", "mean"])
+    assert torch.equal(received["next", "count"], expected["next", "recurrent", "age"])
+
+
+def test_out_keys_as_a_list_or_a_dict_choose_what_is_written():
+    data = with_state(make_frames((3,)), OBS)
+    module = BeliefFilterModule(make_filter(dtype=torch.float64), out_keys=["features"])
+    out = module(data.clone())
+    assert module.out_keys == ["features", ("next", "recurrent", "mean"), ("next", "recurrent", "age")]
+    assert ("belief", "mean") not in out.keys(True)
+    module = BeliefFilterModule(
+        make_filter(dtype=torch.float64),
+        out_keys={"features": ("a", "b"), ("belief", "cov"): "sigma"},
+    )
+    out = module(data.clone())
+    assert out["a", "b"].shape == (3, OBS)
+    assert out["sigma"].shape == (3, OBS, OBS)
+
+
+@pytest.mark.parametrize("over_time", [False, True])
+@pytest.mark.parametrize(
+    ("state", "cov_network"), [(OBS, False), (3, False), (7, False), (3, True)]
+)
+def test_optional_entries_equal_the_textbook(state, cov_network, over_time):
+    model = make_filter(dtype=torch.float64, state=state, cov_network=cov_network)
+    module = BeliefFilterModule(model, out_keys=["features", ("belief", "mean"), *OPTIONAL])
+    data = with_state(make_frames((3, 6)), state)
+    data["is_init"][1, 2] = True
+    data["recurrent", "age"][1, 2] = 0
+    data["is_init"][2, 4] = True  # an older age: the stored state
+    with set_recurrent_mode(over_time):
+        out = module(data.clone())
+
+    emission = model.emission
+    H, R = emission.matrix, emission.cov()
+    for b in range(3):
+        mean = data["recurrent", "mean"][b, 0]
+        for t in range(6):
+            first = bool(data["is_init"][b, t])
+            if first or not over_time:
+                mean = data["recurrent", "mean"][b, t]
+            action = data["previous_action"][b, t]
+            moved = model.transition(mean, action)
+            if first and data["recurrent", "age"][b, t] == 0:
+                moved = functional.Belief(model.initial_mean, model.initial_cov)
+            offset = emission.action_matrix @ action + emission.offset
+            args = (data["observation"][b, t], data["observed"][b, t], H, R, offset)
+            filtered = functional.update(moved, *args)
+            _, S = functional.innovation(moved, *args)
+            mean = filtered.mean
+            for key, expected in (
+                (("belief", "mean"), filtered.mean),
+                (("belief", "cov"), filtered.cov),
+                (("belief", "observation"), H @ filtered.mean + offset),
+                (("belief", "predicted_observation"), H @ moved.mean + offset),
+                (("belief", "innovation_cov"), S),
+            ):
+                torch.testing.assert_close(out[key][b, t], expected, rtol=1e-10, atol=1e-10)
+
+
+def test_optional_entries_are_not_computed_where_not_asked_for(monkeypatch):
+    module = BeliefFilterModule(make_filter(dtype=torch.float64))
+    data = with_state(make_frames((3,)), OBS)
+
+    def never(*args, **kwargs):
+        raise AssertionError("computed although nobody asked")
+
+    monkeypatch.setattr(type(module.filter), "predict", never)
+    out = module(data)
+    for key in OPTIONAL:
+        assert key not in out.keys(True)
+    assert module.filter.step(
+        data["recurrent", "mean"],
+        None,
+        data["previous_action"],
+        data["observation"],
+        data["observed"],
+        data["is_init"].squeeze(-1),
+    ).cov is None
+
+
+def test_mean_cov_features_are_the_mean_and_the_lower_triangle():
+    module = BeliefFilterModule(
+        make_filter(dtype=torch.float64, state=3),
+        policy_input="mean_cov",
+        out_keys=["features", ("belief", "mean"), ("belief", "cov")],
+    )
+    out = module(with_state(make_frames((4,)), 3))
+    assert out["features"].shape == (4, module.feature_dim) == (4, 3 + 6)
+    row, column = torch.tril_indices(3, 3)
+    expected = torch.cat([out["belief", "mean"], out["belief", "cov"][:, row, column]], -1)
+    assert torch.equal(out["features"], expected)
+
+
+# ------------------------------------------------------------------------------- laws of the filter
+def test_what_a_missing_entry_holds_changes_neither_belief_nor_gradient():
+    grads = []
+    for junk in (0.0, 7.0, float("nan"), float("inf")):
+        module = BeliefFilterModule(make_filter(dtype=torch.float64))
+        data = make_frames((3, 5))
+        data["observation"] = torch.where(data["observed"], data["observation"], junk)
+        with set_recurrent_mode(True):
+            out = module(data)
+        (out["features"].sum() + out["belief", "log_likelihood"].sum()).backward()
+        grads.append(torch.cat([p.grad.flatten() for p in module.parameters()]))
+    for grad in grads[1:]:
+        assert torch.equal(grad, grads[0])
+
+
+def test_the_initial_belief_is_learned_through_features_and_through_the_likelihood():
+    for key in ("features", ("belief", "log_likelihood")):
+        module = BeliefFilterModule(make_filter(dtype=torch.float64))
+        with set_recurrent_mode(True):
+            module(make_frames((3, 5)))[key].square().sum().backward()
+        assert module.filter.initial_mean.grad.abs().max() > 1e-3
+        assert module.filter.initial_noise.raw.grad.abs().max() > 1e-3
+
+
+def test_rows_in_mid_episode_send_no_gradient_to_the_initial_belief():
+    module = BeliefFilterModule(make_filter(dtype=torch.float64))
+    with set_recurrent_mode(True):
+        out = module(with_state(make_frames((3, 5)), OBS))
+    out["features"].sum().backward()
+    assert not module.filter.initial_mean.grad.any()
+
+
+# ------------------------------------------------------------------------------------ vmap, deepcopy
+@pytest.mark.parametrize("over_time", [False, True])
+def test_vmap_works_over_the_generic_loop_without_value_checks(over_time):
+    module = BeliefFilterModule(make_filter(dtype=torch.float64, form="loop", validate=False))
+    data = with_state(make_frames((2, 3, 4)), OBS)
+    with set_recurrent_mode(over_time):
+        expected = module(data.clone())["features"]
+        received = torch.vmap(lambda part: module(part)["features"])(data)
+    torch.testing.assert_close(received, expected)
+
+
+def test_vmap_over_one_step_needs_the_value_checks_off():
+    data = with_state(make_frames((2, 3)), OBS)
+    module = BeliefFilterModule(make_filter(dtype=torch.float64, validate=False))
+    expected = module(data.clone())["features"]
+    received = torch.vmap(lambda part: module(part)["features"])(data)
+    torch.testing.assert_close(received, expected)
+    module = BeliefFilterModule(make_filter(dtype=torch.float64))
+    with pytest.raises(RuntimeError, match="vmap"):
+        torch.vmap(lambda part: module(part)["features"])(data)
+
+
+def test_the_fast_forms_refuse_vmap_over_sequences():
+    # GAE(deactivate_vmap=True), as for GRUModule
+    module = BeliefFilterModule(make_filter(dtype=torch.float64, validate=False))
+    data = with_state(make_frames((2, 3, 4)), OBS)
+    with set_recurrent_mode(True), pytest.raises(RuntimeError, match="functorch"):
+        torch.vmap(lambda part: module(part)["features"])(data)
+
+
+# ---------------------------------------------------------------------------------------- bad input
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"in_keys": ["observation"]}, "`in_keys` must have 4 or 6 entries"),
+        ({"in_keys": {"obs": "a"}}, "`in_keys` names"),
+        ({"out_keys": ["belief_mean"]}, "`out_keys` names"),
+        ({"out_keys": {"feature": "a"}}, "`out_keys` names"),
+        ({"policy_input": "cov"}, "`policy_input` must be 'mean' or 'mean_cov', got 'cov'"),
+    ],
+)
+def test_a_wrong_key_or_choice_is_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        BeliefFilterModule(make_filter(), **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("absent", "remedy"),
+    [
+        ("observation", "in_keys"),
+        ("observed", "ObservationMissingness"),
+        ("previous_action", "PreviousAction"),
+        ("is_init", "InitTracker"),
+    ],
+)
+def test_an_absent_entry_is_named_with_its_remedy(absent, remedy):
+    module = BeliefFilterModule(make_filter(dtype=torch.float64))
+    with pytest.raises(KeyError, match=f"`{absent}` is not in the tensordict.*{remedy}"):
+        module(make_frames((3,)).exclude(absent))
+
+
+def test_a_sequence_without_a_batch_dimension_is_refused():
+    module = BeliefFilterModule(make_filter(dtype=torch.float64))
+    with set_recurrent_mode(True), pytest.raises(ValueError, match="no batch dimension"):
+        module(make_frames(()))
+
+
+@pytest.mark.parametrize("over_time", [False, True])
+def test_a_nan_under_a_true_mask_is_refused(over_time):
+    module = BeliefFilterModule(make_filter(dtype=torch.float64))
+    data = with_state(make_frames((3, 4)), OBS)
+    data["observed"][1, 2, 3] = True
+    data["observation"][1, 2, 3] = torch.nan
+    with (
+        set_recurrent_mode(over_time),
+        pytest.raises(ValueError, match=r"NaN or inf .* \(components \[3\]\).*ObservedFromNaN"),
+    ):
+        module(data)
