@@ -6,11 +6,12 @@ from typing import Any
 
 import pytest
 import torch
+from agents import make_filter as make_any_filter
 from contracts import ACTION, OBS, BeliefModuleContract
 from tensordict import TensorDict, TensorDictBase
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn import BeliefFilter, BeliefFilterModule, GaussianTransition, functional
+from torchrl_drbpn import BeliefFilter, BeliefFilterModule, functional
 
 OPTIONAL = (
     ("belief", "cov"),
@@ -21,25 +22,9 @@ OPTIONAL = (
 
 
 def make_filter(
-    obs: int = OBS,
-    action: int = ACTION,
-    dtype: torch.dtype | None = None,
-    state: int | None = None,
-    cov_network: bool = False,
-    **kwargs: Any,
+    obs: int = OBS, action: int = ACTION, dtype: torch.dtype | None = None, **kwargs: Any
 ) -> BeliefFilter:
-    """A filter whose parameters are all away from their starting values."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        if cov_network:
-            kwargs["transition"] = GaussianTransition(
-                state, action, hidden_sizes=(8,), cov="full", cov_network=True, dtype=dtype
-            )
-        belief = BeliefFilter(obs, action, state, dtype=dtype, **kwargs)
-        with torch.no_grad():
-            for parameter in belief.parameters():
-                parameter += 0.1 * torch.randn_like(parameter)
-    return belief
+    return make_any_filter(obs, action, dtype, **kwargs)
 
 
 def make_frames(

@@ -95,6 +95,7 @@ def test_a_step_in_a_worker_reads_the_last_values_that_it_is_given():
         )
 
     env = SerialEnv(2, worker)
+    assert "last_observation" in env.full_state_spec.keys(True, True)
     root = env.reset()
     root["last_observation"] = torch.full_like(root["last_observation"], -50.0)
     after = env.rand_step(root)["next"]

@@ -119,6 +119,7 @@ def test_it_is_the_reward_over_the_spread_of_independently_computed_returns(wher
 
 def test_a_step_in_a_worker_reads_the_return_that_it_is_given():
     env = SerialEnv(2, lambda: TransformedEnv(RewardEnv(), scaled().freeze()))
+    assert "discounted_return" in env.full_state_spec.keys(True, True)
     root = env.reset()
     root["discounted_return"] = torch.full_like(root["discounted_return"], 100.0)
     after = env.rand_step(root)["next"]

@@ -46,7 +46,9 @@ def make_env() -> TransformedEnv:
     )
 
 
-def make_modules(obs_dim: int, action_dim: int):
+def make_modules(
+    obs_dim: int, action_dim: int
+) -> tuple[BeliefFilterModule, ProbabilisticActor, ValueOperator]:
     """Build the belief filter, and the two heads that read its `features`."""
     belief = BeliefFilterModule(BeliefFilter(obs_dim, action_dim))
     width = belief.feature_dim

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+import gymnasium
 from torchrl.envs import (
     Compose,
     InitTracker,
@@ -122,8 +123,8 @@ def _make_base(env: EnvSettings, num_envs: int, num_threads: int) -> GymnasiumBa
     """Build the simulators; what can't be used is the user's to mend."""
     try:
         return GymnasiumBatchEnv(env.env_id, num_envs, num_threads=num_threads)
-    except ValueError as error:
-        raise UserError(str(error)) from error
+    except (ValueError, gymnasium.error.Error) as error:
+        raise UserError(" ".join(str(error).split())) from error
 
 
 def normalisers(env: TransformedEnv) -> list[Transform]:

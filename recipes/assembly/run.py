@@ -88,7 +88,9 @@ class _Run:
         self.training, self.stop = training, stop
         frames = training.progress.frames if resumed else None
         self.metrics = Table(folder / "metrics.csv", metric_columns(training), frames)
-        self.evaluations = Table(folder / "evaluation.csv", EVALUATION_COLUMNS, frames)
+        # Evaluations that the checkpoint does not know of are made again, the final one included.
+        evaluated = training.progress.evaluated_frames if resumed else None
+        self.evaluations = Table(folder / "evaluation.csv", EVALUATION_COLUMNS, evaluated)
         self.episodes = Table(folder / "episodes.csv", ("frames", "return", "length"), frames)
         self.logger: Logger = get_logger(
             settings.logger.backend, logger_name=str(folder), experiment_name="logs"
@@ -104,6 +106,7 @@ class _Run:
         first_frames, first_seconds = progress.frames, progress.train_seconds
         self.clock = time.perf_counter()
         with ProgressBar(settings.total_frames, progress.frames) as bar:
+            self._evaluate_when_due(bar)  # one that a signal cut short
             while progress.frames < settings.total_frames and not self.stop:
                 row, finished = self._timed_rollout()
                 self.metrics.append([row])

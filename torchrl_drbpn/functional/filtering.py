@@ -16,7 +16,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import LOG_2PI, masked_cov, zero_missing
+from torchrl_drbpn.functional.gaussian import (
+    LOG_2PI,
+    check_observed,
+    masked_cov,
+    zero_missing,
+)
 from torchrl_drbpn.functional.kalman import log_likelihood, update
 from torchrl_drbpn.functional.model import (
     Form,
@@ -98,6 +103,7 @@ def filter_step(
         >>> bool((out.mean == 1).all()), bool((out.log_likelihood == 0).all())
         (True, True)
     """
+    check_observed(observation, observed)
     predicted = predict_step(model, mean, previous_action, reset)
     H, offset = model.emission_matrix, model.offset(previous_action)
     if checked_form(model, form) == "loop":
@@ -111,13 +117,17 @@ def filter_step(
     residual = zero_missing(zero_missing(observation, observed) - (offset + m @ H.mT), observed)
     row = reset.unsqueeze(-1)
     if checked_form(model, form) == "information":
-        weight = observed / model.emission_cov
-        precision, log_det_prior = _precision(model, weight, row)
+        # In float64, as in the sequence: the two must agree to the rounding of their own dtype.
+        wide = model.double()
+        residual = residual.double()
+        weight = observed / wide.emission_cov
+        precision, log_det_prior = _precision(wide, weight, row)
         factor = torch.linalg.cholesky(precision)
-        pull = (weight * residual) @ H
+        pull = (weight * residual) @ wide.emission_matrix
         step = torch.cholesky_solve(pull.unsqueeze(-1), factor).squeeze(-1)
         log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + log_det_prior
-        ll = _information_likelihood(model, step, residual, weight, observed, log_det, row)
+        ll = _information_likelihood(wide, step, residual, weight, observed, log_det, row)
+        step, ll = step.to(m.dtype), ll.to(m.dtype)
     else:
         Q = constant_cov(model)
         R = model.full_emission_cov()
@@ -159,8 +169,9 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
         ...     lambda m, a: m, eye, eye, 3 * torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
         ...     torch.zeros(2), eye)
         >>> seen = torch.tensor([True, False])
-        >>> filtered_cov(model, seen, torch.tensor(False)).tolist()
-        [[0.75, 0.0], [0.0, 1.0]]
+        >>> cov = filtered_cov(model, seen, torch.tensor(False))
+        >>> torch.allclose(cov, torch.diag(torch.tensor([0.75, 1.0])))
+        True
     """
     zeros = torch.zeros_like(model.initial_mean).expand(*reset.shape, -1)
     prior = initial_belief(model, reset.unsqueeze(-1), zeros, constant_cov(model))
@@ -222,6 +233,7 @@ def filter_sequence(
         (torch.Size([4, 10, 2]), torch.Size([4, 10]))
     """
     chosen = checked_form(model, form)
+    check_observed(observation, observed)
     batch, time = reset.shape[:-1], reset.shape[-1]
     mean = mean.expand(*batch, mean.shape[-1])
 
@@ -371,17 +383,21 @@ def _information(
     stored: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     f, drive, weights = _network(model, action)
+    y = zero_missing(observation - model.offset(action), observed).double()
+    # Everything ahead of the loop in float64 (see InformationRecurrence).
+    initial_mean = model.initial_mean
+    model = model.double()
     H = model.emission_matrix
-    y = zero_missing(observation - model.offset(action), observed)
     weight = observed / model.emission_cov
     gathered = _gathered(model, weight)
     prior, log_det_prior = _prior_precision(model)
     precision = gathered + torch.where(reset.unsqueeze(-1), prior[1], prior[0])
     m, mean, log_det = InformationRecurrence.apply(  # type: ignore[no-untyped-call]
         f.residual, f.activation, precision, gathered, (weight * y) @ H, reset, restart, stored,
-        start, drive, model.initial_mean, *weights,
+        start, drive, initial_mean, *weights,
     )  # fmt: skip
+    m, step = m.double(), mean.double() - m.double()
     residual = zero_missing(y - m @ H.mT, observed)
     log_det = log_det + torch.where(reset.squeeze(-1), log_det_prior[1], log_det_prior[0])
-    ll = _information_likelihood(model, mean - m, residual, weight, observed, log_det, reset)
-    return mean, ll
+    ll = _information_likelihood(model, step, residual, weight, observed, log_det, reset)
+    return mean, ll.to(mean.dtype)

@@ -11,6 +11,7 @@ from torch.nn.functional import softplus
 
 __all__ = [
     "Belief",
+    "check_observed",
     "full_cov",
     "inverse_softplus",
     "masked_cov",
@@ -39,6 +40,27 @@ class Belief(NamedTuple):
 
     mean: Tensor
     cov: Tensor
+
+
+def check_observed(observation: Tensor, observed: Tensor) -> None:
+    """Refuse a mask that would broadcast or be read as numbers.
+
+    Args:
+        observation: shape ``(*batch, obs)``.
+        observed: bool, the same shape.
+
+    Raises:
+        ValueError: if the mask is not bool or not of the observation's shape.
+
+    Example:
+        >>> import torch
+        >>> check_observed(torch.zeros(2, 3), torch.ones(2, 3, dtype=torch.bool))
+    """
+    if observed.dtype is not torch.bool or observed.shape != observation.shape:
+        raise ValueError(
+            f"`observed` must be bool of the observation's shape {tuple(observation.shape)}, got "
+            f"{observed.dtype} {tuple(observed.shape)}. One entry a component: True = arrived."
+        )
 
 
 def zero_missing(values: Tensor, observed: Tensor) -> Tensor:
@@ -177,7 +199,9 @@ def full_cov(raw: Tensor, min_std: float) -> Tensor:
     """
     tril = raw.tril(-1) + torch.diag_embed(softplus(raw.diagonal(dim1=-2, dim2=-1)))
     eye = torch.eye(raw.shape[-1], dtype=raw.dtype, device=raw.device)
-    return tril @ tril.mT + (min_std * min_std) * eye
+    cov = tril @ tril.mT
+    # A matrix product may round the two triangles differently.
+    return 0.5 * (cov + cov.mT) + (min_std * min_std) * eye
 
 
 def tril_to_vector(cov: Tensor) -> Tensor:

@@ -13,7 +13,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import Belief, masked_cov, masked_log_density, zero_missing
+from torchrl_drbpn.functional.gaussian import (
+    Belief,
+    check_observed,
+    masked_cov,
+    masked_log_density,
+    zero_missing,
+)
 
 __all__ = ["innovation", "log_likelihood", "predict", "update"]
 
@@ -57,7 +63,8 @@ def predict(
     mean = transition(belief.mean, previous_action)
     if jacobian is None:
         return Belief(mean, transition_cov.expand(*mean.shape, mean.shape[-1]))
-    return Belief(mean, jacobian @ belief.cov @ jacobian.mT + transition_cov)
+    moved = jacobian @ belief.cov @ jacobian.mT
+    return Belief(mean, 0.5 * (moved + moved.mT) + transition_cov)
 
 
 def innovation(
@@ -92,6 +99,7 @@ def innovation(
         >>> v.tolist(), S.diagonal().tolist()
         ([1.0, 0.0], [2.0, 2.0])
     """
+    check_observed(observation, observed)
     H = emission_matrix
     expected = belief.mean @ H.mT
     if offset is not None:
@@ -135,8 +143,9 @@ def update(
         >>> belief = Belief(torch.zeros(2), torch.eye(2))
         >>> seen = torch.tensor([True, False])
         >>> mean, cov = update(belief, torch.ones(2), seen, torch.eye(2), 3 * torch.eye(2))
-        >>> mean.tolist(), cov.tolist()
-        ([0.25, 0.0], [[0.75, 0.0], [0.0, 1.0]])
+        >>> expected = torch.diag(torch.tensor([0.75, 1.0]))
+        >>> mean.tolist(), torch.allclose(cov, expected)
+        ([0.25, 0.0], True)
     """
     H = emission_matrix
     v, S = innovation(belief, observation, observed, H, emission_cov, offset)
@@ -150,6 +159,11 @@ def update(
     kept = eye - K @ H
     cov = kept @ belief.cov @ kept.mT + K @ emission_cov @ K.mT
     cov = 0.5 * (cov + cov.mT)
+    # Rounding errs by about eps sqrt(P_ii P_jj) in every entry. Directions measured thousands of
+    # times without a predict between hold less variance than that beside directions never
+    # measured, and the matrix would turn indefinite: raise the diagonal by the rounding unit.
+    lift = torch.finfo(cov.dtype).eps * belief.cov.diagonal(dim1=-2, dim2=-1).detach()
+    cov = cov + torch.diag_embed(lift)
     anything = observed.any(-1)[..., None, None]
     return Belief(mean, torch.where(anything, cov, belief.cov))
 

@@ -55,6 +55,12 @@ class StateSpace(NamedTuple):
     initial_mean: Tensor
     initial_cov: Tensor
 
+    def double(self) -> StateSpace:
+        """Return the same model in float64; a function keeps its own dtype."""
+        Q = self.transition_cov
+        wide_Q = Q.double() if isinstance(Q, Tensor) else Q
+        return StateSpace(self.transition, wide_Q, *(x.double() for x in self[2:]))
+
     def full_emission_cov(self) -> Tensor:
         """Return R as a matrix, shape ``(obs, obs)``."""
         return self.emission_cov.diag() if self.emission_cov.ndim == 1 else self.emission_cov

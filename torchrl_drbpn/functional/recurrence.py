@@ -364,8 +364,10 @@ class InformationRecurrence(torch.autograd.Function):
         reset, restart, restart_mean, start, drive, initial_mean, first, *rest = args[5:]
         steps = _Steps(residual, activation, first, tuple(rest))
         C, log_det, _ = _spd_factor(precision)
-        D = C @ gathered
-        c = (C @ evidence.unsqueeze(-1)).squeeze(-1)
+        # precision, gathered and evidence come in float64: inverted in float32 with R at its floor
+        # they lose most digits. What the loop needs is well scaled and goes back to its dtype.
+        D = (C @ gathered).to(start.dtype)
+        c = (C @ evidence.unsqueeze(-1)).squeeze(-1).to(start.dtype)
         predicted, filtered, inputs, hidden = _run(
             steps, drive, start, reset, initial_mean, restart, restart_mean, D, c, None
         )
@@ -391,9 +393,9 @@ class InformationRecurrence(torch.autograd.Function):
         g_mean = torch.zeros_like(m) if g_mean is None else g_mean
         back = _run_back(steps, reset, restart, D, layers, g_mean, g_m, None, None)
 
-        p = C @ back.filtered.view_as(m).unsqueeze(-1)  # by b_t - N_t m_t
-        g_gathered = -p @ m.unsqueeze(-2)
-        g_precision = -p @ (mean - m).unsqueeze(-2)
+        p = C @ back.filtered.view_as(m).unsqueeze(-1).to(C.dtype)  # by b_t - N_t m_t
+        g_gathered = -p @ m.unsqueeze(-2).to(C.dtype)
+        g_precision = -p @ (mean - m).unsqueeze(-2).to(C.dtype)
         if g_log_det is not None:
             g_precision = torch.addcmul(g_precision, g_log_det[..., None, None], C)
         was_reset = reset.reshape(-1, 1)

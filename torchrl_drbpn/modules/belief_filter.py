@@ -124,6 +124,14 @@ class BeliefFilter(nn.Module):
         self.initial_mean = nn.Parameter(torch.zeros(state_dim, device=device, dtype=dtype))
         self.initial_noise = initial_covariance(state_dim, initial_cov, initial_std, device, dtype)
 
+    def reset_parameters(self) -> None:
+        """Start again, the parts included where they know how."""
+        nn.init.zeros_(self.initial_mean)
+        for part in self.children():
+            reset = getattr(part, "reset_parameters", None)
+            if callable(reset):
+                reset()
+
     # ------------------------------------------------------------------ the model as tensors
     @property
     def initial_cov(self) -> Tensor:
@@ -300,11 +308,12 @@ class BeliefFilter(nn.Module):
                     f"{_describe(value)}. Was the filter built for another environment?"
                 )
         dtype = self.initial_mean.dtype
-        if observation.dtype != dtype:
-            raise ValueError(
-                f"`observation` is {observation.dtype}, the filter's parameters are {dtype}: add "
-                "TorchRL's DoubleToFloat to the environment, or build the filter with dtype=."
-            )
+        for name, value, _, _ in wanted:
+            if value.dtype != dtype:
+                raise ValueError(
+                    f"`{name}` is {value.dtype}, the filter's parameters are {dtype}: add "
+                    "TorchRL's DoubleToFloat to the environment, or build the filter with dtype=."
+                )
 
     def _check_values(self, out: FilterOutput, observation: Tensor, observed: Tensor) -> None:
         """Raise on a value that cannot be; one reduction over (*batch,) tells."""

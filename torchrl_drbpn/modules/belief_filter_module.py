@@ -119,6 +119,8 @@ class BeliefFilterModule(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the belief; see the class for keys and modes."""
         observation, observed, action, is_init = (self._get(tensordict, i) for i in range(4))
+        # Simulators take float32 actions beside float64 observations; a cast loses nothing there.
+        action = action.to(self.filter.initial_mean.dtype)
         mean = tensordict.get(self.in_keys[4], None)
         age = tensordict.get(self.in_keys[5], None)
         first = is_init.squeeze(-1)

@@ -62,7 +62,7 @@ class _Covariance(nn.Module):
         super().__init__()
         _check_choice("cov", kind, ("diag", "full"))
         _check_std(init_std, min_std)
-        self.kind, self.min_std = kind, min_std
+        self.kind, self.init_std, self.min_std = kind, init_std, min_std
         raw = torch.zeros(dim, device=device, dtype=dtype)
         if kind == "diag":
             raw = raw + inverse_softplus(torch.tensor(init_std - min_std, device=device))
@@ -70,6 +70,15 @@ class _Covariance(nn.Module):
             spread = torch.tensor(init_std**2 - min_std**2, device=device).sqrt()
             raw = torch.diag_embed(raw + inverse_softplus(spread))
         self.raw = nn.Parameter(raw.to(dtype or torch.get_default_dtype()))
+
+    def reset_parameters(self) -> None:
+        """Put the standard deviations back to ``init_std``."""
+        raw = self.raw
+        start = _Covariance(
+            raw.shape[-1], self.kind, self.init_std, self.min_std, raw.device, raw.dtype
+        )
+        with torch.no_grad():
+            raw.copy_(start.raw)
 
     def variance(self) -> Tensor:
         """Return the variances, shape (dim,); a diagonal covariance only."""
@@ -157,7 +166,7 @@ class GaussianTransition(nn.Module):
         _check_choice("cov", cov, ("diag", "full"))
         _check_std(init_std, min_std)
         self.residual, self.activation = residual, activation
-        self.cov_kind, self.min_std = cov, min_std
+        self.cov_kind, self.init_std, self.min_std = cov, init_std, min_std
 
         def network(out_features: int) -> nn.ModuleList:
             sizes = [state_dim + action_dim, *hidden_sizes, out_features]
@@ -170,14 +179,27 @@ class GaussianTransition(nn.Module):
         self.noise: _Covariance | None = None
         if cov_network:
             self.cov_layers = network(state_dim if cov == "diag" else state_dim * state_dim)
-            with torch.no_grad():
-                # Start from the constant init_std: the last layer begins with the bias alone.
-                start = _Covariance(state_dim, cov, init_std, min_std, device, dtype).raw
-                weight, bias = _linear(self.cov_layers[-1:])[-1]
-                weight.zero_()
-                bias.copy_(start.flatten())
+            self._start_from_init_std(_linear(self.cov_layers))
         else:
             self.noise = _Covariance(state_dim, cov, init_std, min_std, device, dtype)
+
+    def _start_from_init_std(self, layers: list[tuple[Tensor, Tensor]]) -> None:
+        """Make the network Q begin as the constant init_std: its last layer as the bias alone."""
+        weight, bias = layers[-1]
+        start = _Covariance(
+            self.state_dim, self.cov_kind, self.init_std, self.min_std, bias.device, bias.dtype
+        )
+        with torch.no_grad():
+            weight.zero_()
+            bias.copy_(start.raw.flatten())
+
+    def reset_parameters(self) -> None:
+        """Start again: new weights for f, the covariance from ``init_std``."""
+        for module in self.modules():
+            if module is not self and isinstance(module, nn.Linear | _Covariance):
+                module.reset_parameters()
+        if self.cov_layers is not None:
+            self._start_from_init_std(_linear(self.cov_layers))
 
     def mean_network(self) -> MeanNetwork:
         """Return f as tensors, as the fast filter wants it."""
@@ -294,6 +316,13 @@ class LinearGaussianEmission(nn.Module):
         )
         self.offset = nn.Parameter(torch.zeros(obs_dim, device=device, dtype=dtype))
         self.noise = _Covariance(obs_dim, cov, init_std, min_std, device, dtype)
+
+    def reset_parameters(self) -> None:
+        """Start again: H = [I 0], B and d zero, R from ``init_std``."""
+        nn.init.eye_(self.matrix)
+        nn.init.zeros_(self.action_matrix)
+        nn.init.zeros_(self.offset)
+        self.noise.reset_parameters()
 
     def cov(self) -> Tensor:
         """Return R, shape ``(obs, obs)``."""

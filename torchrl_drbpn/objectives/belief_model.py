@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
 import torch
@@ -80,13 +80,13 @@ class BeliefModelLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Entries the loss cannot do without."""
-        return [self.tensor_keys.log_likelihood, self.tensor_keys.observed]
+        """Entries read; the loss cannot do without the first two."""
+        return [getattr(self.tensor_keys, field.name) for field in fields(self._AcceptedKeys)]
 
     @in_keys.setter
     def in_keys(self, value: list[NestedKey]) -> None:
-        log_likelihood, observed = value
-        self.set_keys(log_likelihood=log_likelihood, observed=observed)
+        names = [field.name for field in fields(self._AcceptedKeys)]
+        self.set_keys(**dict(zip(names, value, strict=False)))
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Do nothing: this loss estimates no value."""
@@ -104,6 +104,12 @@ class BeliefModelLoss(LossModule):
             raise KeyError(
                 f"`{absent}` is not in the tensordict: run the belief module on it first, under "
                 "set_recurrent_mode(True)."
+            )
+        if observed.dtype is not torch.bool or observed.shape[:-1] != ll.shape:
+            raise ValueError(
+                f"`{keys.observed}` must be bool of shape (*batch, obs) with *batch = "
+                f"{tuple(ll.shape)}, that of the log-likelihood, got {observed.dtype} "
+                f"{tuple(observed.shape)}."
             )
         steps = torch.ones_like(ll)
         entries = observed.sum(-1).to(ll.dtype)

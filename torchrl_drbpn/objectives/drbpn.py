@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams, unravel_key
+from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torchrl.modules import set_recurrent_mode
@@ -42,6 +43,8 @@ class DRBPNLoss(LossModule):
     Keyword Args:
         model_coeff: lambda_m, at least 0; ``loss.model_coeff = 0.3`` changes it in place.
         detach_belief: keep PPO's gradient out of the filter.
+        functional: whether the belief module is functionalised, as in ClipPPOLoss; False spares
+            the swapping of its parameters at every call.
 
     Raises:
         ValueError: for a negative coefficient.
@@ -86,7 +89,7 @@ class DRBPNLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     filter_network: TensorDictModuleBase
-    filter_network_params: TensorDictParams
+    filter_network_params: TensorDictParams | None
     target_filter_network_params: TensorDictParams
     _schedulable_buffers = frozenset({"model_coeff"})
 
@@ -98,11 +101,17 @@ class DRBPNLoss(LossModule):
         *,
         model_coeff: float = 1.0,
         detach_belief: bool = False,
+        functional: bool = True,
     ) -> None:
         super().__init__()
         if model_coeff < 0:
             raise ValueError(f"`model_coeff` must be at least 0, got {model_coeff}.")
-        self.convert_to_functional(filter_module, "filter_network")
+        self._functional = functional
+        if functional:
+            self.convert_to_functional(filter_module, "filter_network")
+        else:
+            self.filter_network = filter_module
+            self.filter_network_params = None
         self.ppo_loss = ppo_loss
         self.model_loss = model_loss
         self.detach_belief = detach_belief
@@ -126,12 +135,10 @@ class DRBPNLoss(LossModule):
         for part in (self.ppo_loss, self.model_loss):
             if part is not None:
                 accepted = {f.name for f in fields(part.default_keys)}
-                its = {
+                its = {name: key for name, key in kwargs.items() if name in accepted}
+                if part is self.ppo_loss and "done" in its:
                     # PPO names the entry inside "next", the model loss from the root.
-                    name: key[1:] if name == "done" and key and part is self.ppo_loss else key
-                    for name, key in kwargs.items()
-                    if name in accepted
-                }
+                    its["done"] = _inside_next(its["done"])
                 part.set_keys(**its)
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
@@ -183,6 +190,11 @@ class DRBPNLoss(LossModule):
         """
         self.ppo_loss.make_value_estimator(value_type, **hyperparams)
 
+    def reset_parameters_recursive(self) -> None:
+        """Put every parameter back to where a new module starts, the held losses' too."""
+        super().reset_parameters_recursive()
+        self.ppo_loss.reset_parameters_recursive()
+
     # ------------------------------------------------------------------ forward
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -194,7 +206,12 @@ class DRBPNLoss(LossModule):
                 "rollout first (TorchRL's GAE), then cut it into minibatches."
             )
         data = tensordict.copy()
-        with self.filter_network_params.to_module(self.filter_network, preserve_module_state=False):
+        params = self.filter_network_params
+        with (
+            nullcontext()
+            if params is None
+            else params.to_module(self.filter_network, preserve_module_state=False)
+        ):
             self.filter_network(data)
             if self.model_loss is not None:
                 self._add_last_observations(data)
@@ -215,23 +232,30 @@ class DRBPNLoss(LossModule):
         many matrices as the filter itself.
         """
         keys = self.tensor_keys
-        inputs = [unravel_key(("next", key)) for key in self.filter_network.in_keys]
-        following = data.select(*inputs, strict=False).get("next", None)
-        log_likelihood = data.get(keys.log_likelihood)
-        if following is None or data.get(keys.next_observed, None) is None:
-            return
+        log_likelihood = data.get(keys.log_likelihood, None)
+        if log_likelihood is None or data.get(keys.next_observed, None) is None:
+            return  # the model loss says what is missing; without a next step nothing is added
         where = last_steps(data, done=keys.done, final=keys.final, like=log_likelihood).nonzero(
             as_tuple=True
         )
-        gathered = following[where]
-        # A collector writes next.is_init = False; a belief that goes on is what is wanted here.
-        gathered.set(
-            keys.is_init,
-            torch.zeros(*gathered.shape, 1, dtype=torch.bool, device=log_likelihood.device),
-        )
+        gathered = TensorDict({}, batch_size=where[0].shape)
+        for key in self.filter_network.in_keys:
+            following = data.get(("next", key), None)
+            if following is not None and key != keys.is_init:
+                gathered.set(key, following[where])
+        # A belief that goes on is what is wanted here.
+        start = torch.zeros(*gathered.shape, 1, dtype=torch.bool, device=log_likelihood.device)
+        gathered.set(keys.is_init, start)
         with set_recurrent_mode(False):
             self.filter_network(gathered)
         data.set(
             keys.next_log_likelihood,
             torch.zeros_like(log_likelihood).index_put(where, gathered.get(keys.log_likelihood)),
         )
+
+
+def _inside_next(key: NestedKey | None) -> NestedKey | None:
+    """Return ``("next", key)`` as PPO names it, without "next"."""
+    if isinstance(key, tuple) and key[0] == "next":
+        return unravel_key(key[1:])
+    return key

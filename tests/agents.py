@@ -1,0 +1,137 @@
+"""A small actor-critic on InvertedPendulum-v5 around any belief module, from TorchRL's parts.
+
+Shared by the tests of losses and pipelines. Three environments in one batch; the poles fall after
+some steps (terminated) or the time limit comes first (truncated), so that a rollout of 24 steps
+holds both ends inside rows, and the second one begins in mid-episode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from contracts import with_belief_entries
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.modules import (
+    IndependentNormal,
+    ProbabilisticActor,
+    ValueOperator,
+    set_recurrent_mode,
+)
+from torchrl.objectives.value import GAE
+
+from torchrl_drbpn import BeliefFilter, GaussianTransition, GymnasiumBatchEnv
+
+OBS, ACTION, ENVS, TIME, LIMIT = 4, 1, 3, 24, 9
+
+
+@dataclass
+class Agent:
+    """A belief module and the heads that read its features."""
+
+    belief: TensorDictModuleBase
+    actor: ProbabilisticActor
+    critic: ValueOperator
+
+    @property
+    def policy(self) -> TensorDictSequential:
+        return TensorDictSequential(self.belief, self.actor)
+
+    @property
+    def value(self) -> TensorDictSequential:
+        return TensorDictSequential(self.belief, self.critic)
+
+
+def make_filter(
+    obs: int,
+    action: int,
+    dtype: torch.dtype | None = None,
+    state: int | None = None,
+    cov_network: bool = False,
+    perturb: bool = True,
+    **kwargs: Any,
+) -> BeliefFilter:
+    """A filter of fixed parameters, all away from their starting values if `perturb`."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        if cov_network:
+            kwargs["transition"] = GaussianTransition(
+                state, action, hidden_sizes=(8,), cov="full", cov_network=True, dtype=dtype
+            )
+        belief = BeliefFilter(obs, action, state, dtype=dtype, **kwargs)
+        with torch.no_grad():
+            for parameter in belief.parameters():
+                if perturb:
+                    parameter += 0.1 * torch.randn_like(parameter)
+    return belief
+
+
+def make_agent(
+    belief: TensorDictModuleBase,
+    feature_dim: int,
+    *,
+    features: str = "features",
+    dtype: torch.dtype = torch.float64,
+    init_std: float = 2.0,
+) -> Agent:
+    """Heads of fixed weights; a wide policy makes the poles fall soon."""
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        head = nn.Sequential(
+            nn.Linear(feature_dim, 8, dtype=dtype),
+            nn.Tanh(),
+            nn.Linear(8, 2 * ACTION, dtype=dtype),
+            NormalParamExtractor(scale_mapping=f"biased_softplus_{init_std}"),
+        )
+        actor = ProbabilisticActor(
+            TensorDictModule(head, [features], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=IndependentNormal,
+            return_log_prob=True,
+        )
+        critic = ValueOperator(nn.Linear(feature_dim, 1, dtype=dtype), in_keys=[features])
+    return Agent(belief, actor, critic)
+
+
+def make_env(dtype: torch.dtype = torch.float64, seed: int = 0) -> TransformedEnv:
+    """Three pendulums, half of the entries missing; the primer is left to the collector."""
+    base = GymnasiumBatchEnv(
+        "InvertedPendulum-v5", ENVS, seed=seed, dtype=dtype, max_episode_steps=LIMIT
+    )
+    return with_belief_entries(TransformedEnv(base, Compose()), to_float32=False)
+
+
+def collect(agent: Agent, batches: int = 2, dtype: torch.dtype = torch.float64) -> TensorDictBase:
+    """The last of some batches of (ENVS, TIME) steps: rows that start in mid-episode."""
+    with torch.random.fork_rng():
+        torch.manual_seed(2)
+        collector = Collector(
+            make_env(dtype),
+            agent.policy,
+            frames_per_batch=ENVS * TIME,
+            total_frames=batches * ENVS * TIME,
+            auto_register_policy_transforms=True,
+        )
+        try:
+            data = [batch.clone() for batch in collector][-1]
+        finally:
+            collector.shutdown()
+    return data
+
+
+def add_advantages(agent: Agent, data: TensorDictBase) -> TensorDictBase:
+    """TorchRL's GAE through the belief module, in place."""
+    gae = GAE(gamma=0.99, lmbda=0.95, value_network=agent.value, deactivate_vmap=True)
+    with set_recurrent_mode(True), torch.no_grad():
+        gae(data)
+    return data

@@ -1,0 +1,181 @@
+"""What `BeliefModelLoss` is held to: a loss's duties, and minus the log-likelihood, each once.
+
+Eq. (12) [DRBPN]: the sum over observed entries, divided by entries (or by steps). The next
+observation counts where no root step holds it: at the end of an episode, and where `final` says
+that the rollout was cut.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from contracts import LossContract
+from tensordict import TensorDict
+
+from torchrl_drbpn import BeliefModelLoss
+
+OBS, BATCH, TIME = 4, 3, 5
+
+
+def make_data(dtype: torch.dtype = torch.float32, seed: int = 0) -> TensorDict:
+    """Log-likelihoods and masks of a rollout, with its next step; done inside rows."""
+    g = torch.Generator().manual_seed(seed)
+    shape = (BATCH, TIME)
+
+    def part() -> dict:
+        observed = torch.rand(*shape, OBS, generator=g) < 0.5
+        ll = torch.randn(*shape, generator=g, dtype=dtype)
+        ll = torch.where(observed.any(-1), ll, 0.0)
+        return {"observed": observed, "belief": {"log_likelihood": ll}}
+
+    done = torch.zeros(*shape, 1, dtype=torch.bool)
+    done[0, 2] = done[1, 0] = done[2, 4] = True
+    final = torch.zeros(*shape, 1, dtype=torch.bool)
+    final[:, -1] = True
+    data = TensorDict({**part(), "next": {**part(), "done": done}, "final": final}, shape)
+    data["belief", "log_likelihood"].requires_grad_()
+    return data
+
+
+def counted(data: TensorDict) -> tuple[torch.Tensor, int, int]:
+    """Sum of log-likelihoods, entries and steps that count, one step at a time."""
+    total, entries, steps = torch.zeros((), dtype=torch.float64), 0, 0
+    for b in range(BATCH):
+        for t in range(TIME):
+            steps += 1
+            entries += int(data["observed"][b, t].sum())
+            total = total + data["belief", "log_likelihood"][b, t]
+            if data["next", "done"][b, t] or data["final"][b, t]:
+                steps += 1
+                entries += int(data["next", "observed"][b, t].sum())
+                total = total + data["next", "belief", "log_likelihood"][b, t]
+    return total, entries, steps
+
+
+class TestContract(LossContract):
+    has_networks = False
+    reductions = ("none", "mean", "sum")
+
+    def make_loss(self, **kwargs):
+        return BeliefModelLoss(**kwargs)
+
+    def make_loss_data(self, dtype=torch.float32):
+        return make_data(dtype).detach()
+
+    test_parameters_can_be_reset = None  # there are none
+
+
+@pytest.mark.parametrize("normalize", ["entry", "step"])
+def test_it_is_minus_the_sum_over_what_arrived(normalize):
+    data = make_data(torch.float64)
+    total, entries, steps = counted(data)
+    out = BeliefModelLoss(normalize=normalize)(data)
+    expected = -total / (entries if normalize == "entry" else steps)
+    torch.testing.assert_close(out["loss_model"], expected, rtol=1e-12, atol=0)
+    # the metric is per entry whatever the loss is divided by, and carries no gradient
+    torch.testing.assert_close(out["log_likelihood"], total / entries, rtol=1e-12, atol=0)
+    assert out["loss_model"].requires_grad
+    assert not out["log_likelihood"].requires_grad
+
+
+def test_sum_and_none_are_in_nats_whatever_the_normalisation():
+    data = make_data(torch.float64)
+    total, *_ = counted(data)
+    for normalize in ("entry", "step"):
+        value = BeliefModelLoss(normalize=normalize, reduction="sum")(data)["loss_model"]
+        torch.testing.assert_close(value, -total, rtol=1e-12, atol=0)
+        each = BeliefModelLoss(normalize=normalize, reduction="none")(data)["loss_model"]
+        assert each.shape == data.shape
+        torch.testing.assert_close(each.sum(), -total, rtol=1e-12, atol=1e-12)
+
+
+def test_without_next_likelihoods_the_root_steps_count_alone():
+    data = make_data(torch.float64).select(("belief", "log_likelihood"), "observed")
+    value = BeliefModelLoss()(data)["loss_model"]
+    expected = -data["belief", "log_likelihood"].sum() / data["observed"].sum()
+    torch.testing.assert_close(value, expected)
+
+
+def test_a_step_that_is_done_and_final_counts_its_next_observation_once():
+    data = make_data(torch.float64)
+    assert data["next", "done"][2, -1]
+    with_both = BeliefModelLoss(reduction="sum")(data)["loss_model"]
+    data["final"][2, -1] = False
+    assert torch.equal(BeliefModelLoss(reduction="sum")(data)["loss_model"], with_both)
+
+
+@pytest.mark.parametrize("normalize", ["entry", "step"])
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_nothing_observed_at_all_is_a_finite_zero(normalize, reduction):
+    ll = torch.zeros(2, 3, requires_grad=True)
+    data = TensorDict(
+        {
+            ("belief", "log_likelihood"): ll * 1.0,
+            "observed": torch.zeros(2, 3, OBS, dtype=torch.bool),
+        },
+        [2, 3],
+    )
+    out = BeliefModelLoss(normalize=normalize, reduction=reduction)(data)
+    assert out["loss_model"] == 0
+    assert out["log_likelihood"] == 0
+    out["loss_model"].backward()
+    assert ll.grad.isfinite().all()
+
+
+def test_steps_that_torchrl_marks_invalid_do_not_count():
+    data = make_data(torch.float64)
+    mask = torch.ones(BATCH, TIME, 1, dtype=torch.bool)
+    mask[:, 3:] = False
+    cut = BeliefModelLoss()(data[:, :3])["loss_model"]
+    data["collector", "mask"] = mask
+    data["belief", "log_likelihood"].data[:, 3:] = torch.nan  # padding may hold anything
+    torch.testing.assert_close(BeliefModelLoss()(data)["loss_model"], cut)
+
+
+def test_every_entry_read_can_be_renamed():
+    data = make_data()
+    expected = BeliefModelLoss()(data)["loss_model"]
+    names = {
+        "log_likelihood": (("belief", "log_likelihood"), "ll"),
+        "observed": ("observed", ("agent", "mask")),
+        "next_log_likelihood": (("next", "belief", "log_likelihood"), ("next", "ll")),
+        "next_observed": (("next", "observed"), ("next", "agent", "mask")),
+        "done": (("next", "done"), ("next", "agent", "done")),
+        "final": ("final", "cut"),
+    }
+    loss = BeliefModelLoss()
+    for name, (old, new) in names.items():
+        data.rename_key_(old, new)
+        loss.set_keys(**{name: new})
+    assert torch.equal(loss(data)["loss_model"], expected)
+    other = BeliefModelLoss()
+    other.in_keys = loss.in_keys
+    assert torch.equal(other(data)["loss_model"], expected)
+
+
+# ---------------------------------------------------------------------------------------- bad input
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"normalize": "batch"}, "`normalize` must be 'entry' or 'step', got 'batch'"),
+        ({"reduction": "max"}, "`reduction` must be 'none', 'mean' or 'sum', got 'max'"),
+    ],
+)
+def test_an_unknown_choice_is_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        BeliefModelLoss(**kwargs)
+
+
+@pytest.mark.parametrize("absent", [("belief", "log_likelihood"), "observed"])
+def test_an_absent_entry_is_named_with_what_to_do(absent):
+    with pytest.raises(KeyError, match="is not in the tensordict: run the belief module on it"):
+        BeliefModelLoss()(make_data().exclude(absent))
+
+
+@pytest.mark.parametrize(
+    "observed", [torch.ones(BATCH, TIME, OBS), torch.ones(BATCH, TIME, dtype=torch.bool)]
+)
+def test_a_mask_of_wrong_dtype_or_shape_is_refused(observed):
+    data = make_data().set("observed", observed)
+    with pytest.raises(ValueError, match=r"`observed` must be bool of shape \(\*batch, obs\)"):
+        BeliefModelLoss()(data)

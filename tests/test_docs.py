@@ -1,0 +1,269 @@
+"""What the pages are held to: they name what exists, leave nothing out, and their code runs.
+
+theory.md maps every equation of the paper to functions and tests: each function resolves by
+import, each test exists, and every equation that a docstring cites has a row that names the owner
+of that docstring. api.md lists the public names. Relative links lead somewhere. The guide's code is
+the script beside it, block for block, and the script runs by itself in another folder.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+PACKAGE = ROOT / "torchrl_drbpn"
+PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+SCRIPT = DOCS / "guide" / "library_example.py"
+GUIDE = DOCS / "guide" / "belief_in_your_ppo.md"
+EQUATIONS = {2, 3, 8, 10, 11, 12, 13}
+
+# "Eq. (8), (10), (12) [DRBPN]", "eq. 2, 3, 8 [DRBPN]", "(eq. 10 and 12 [DRBPN])"
+CITATION = re.compile(r"\b[Ee]qs?\.\s+((?:\(?\d+\)?(?:,\s+|\s+and\s+)?)+)\s+\[DRBPN\]")
+
+
+def ids(pages: list[Path]) -> list[str]:
+    return [str(page.relative_to(ROOT)) for page in pages]
+
+
+# ----------------------------------------------------------------------------------- reading pages
+def tables(page: Path) -> Iterator[list[list[str]]]:
+    """The tables of a page, each as its rows of cells without the rule."""
+    rows: list[list[str]] = []
+    for line in [*page.read_text(encoding="utf-8").splitlines(), ""]:
+        if line.startswith("|"):
+            rows.append([cell.strip() for cell in line.strip("|").split("|")])
+        elif rows:
+            yield [row for row in rows if not re.fullmatch(r"[-: ]+", row[0])]
+            rows = []
+
+
+def quoted(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def equation_rows() -> list[tuple[set[int], list[str], list[str]]]:
+    """Each row of the table of equations: its numbers, the code and the tests it names."""
+    head, *rows = next(tables(DOCS / "theory.md"))
+    assert head == ["equation", "what it says", "code", "tests"]
+    return [
+        ({int(n) for n in re.findall(r"\((\d+)\)", row[0])}, quoted(row[2]), quoted(row[3]))
+        for row in rows
+    ]
+
+
+def resolve(name: str) -> Any:
+    """The object called `torchrl_drbpn.<name>`."""
+    value: Any = importlib.import_module(PACKAGE.name)
+    path = PACKAGE.name
+    for part in name.split("."):
+        path += f".{part}"
+        if not hasattr(value, part):
+            importlib.import_module(path)
+        value = getattr(value, part)
+    return value
+
+
+@cache
+def names_of_tests(file: str) -> frozenset[str]:
+    """Every test function of a file, those of its classes included."""
+    tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
+    return frozenset(
+        node.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    )
+
+
+# ---------------------------------------------------------------------------------------- theory.md
+def test_every_equation_has_a_row_with_code_and_tests():
+    rows = equation_rows()
+    assert set().union(*(numbers for numbers, _, _ in rows)) >= EQUATIONS
+    for numbers, code, tests in rows:
+        assert numbers, "a row without a number"
+        assert code, numbers
+        assert tests, numbers
+
+
+def test_every_name_in_the_table_resolves():
+    for numbers, code, _ in equation_rows():
+        for name in code:
+            try:
+                value = resolve(name)
+            except (AttributeError, ImportError):
+                pytest.fail(f"theory.md, equation {sorted(numbers)}: no `{name}`")
+            assert callable(value), name
+
+
+def test_every_test_that_theory_names_exists():
+    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(test_\w+\.py|contracts\.py)::(\w+)`", text)
+    assert len(named) > len(EQUATIONS)
+    for file, test in named:
+        assert (ROOT / "tests" / file).is_file(), file
+        assert test in names_of_tests(file), f"{file}::{test}"
+    for _, _, tests in equation_rows():
+        for test in tests:
+            assert re.fullmatch(r"\w+\.py::test_\w+", test), test
+
+
+def test_every_code_name_in_the_prose_of_theory_resolves():
+    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+    for name in re.findall(r"`(functional\.[\w.]+)`", text):
+        assert resolve(name) is not None, name
+
+
+def citations() -> list[tuple[str, str, set[int]]]:
+    """Every docstring that cites the paper: file, name of the top-level owner, equations."""
+    found = []
+    for file in sorted(PACKAGE.rglob("*.py")):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for owner in [tree, *tree.body]:
+            if not isinstance(owner, ast.Module | ast.ClassDef | ast.FunctionDef):
+                continue
+            text = ast.get_docstring(owner) or ""
+            numbers = {
+                int(n) for listed in CITATION.findall(text) for n in re.findall(r"\d+", listed)
+            }
+            if numbers:
+                name = "" if isinstance(owner, ast.Module) else owner.name
+                found.append((str(file.relative_to(ROOT)), name, numbers))
+    return found
+
+
+def test_every_equation_that_a_docstring_cites_has_a_row_that_names_it():
+    rows = equation_rows()
+    owners = {n: {name.split(".")[-1] for s, code, _ in rows if n in s for name in code}
+              for n in set().union(*(s for s, _, _ in rows))}  # fmt: skip
+    found = citations()
+    assert {n for _, _, numbers in found for n in numbers} >= EQUATIONS
+    for file, name, numbers in found:
+        for number in numbers:
+            assert number in owners, f"{file}: {name} cites eq. ({number}), which has no row"
+            if name and not name.startswith("_"):
+                assert name in owners[number], f"theory.md, eq. ({number}): `{name}` of {file}"
+
+
+def test_every_mention_of_the_paper_is_understood():
+    """A citation in another spelling would escape the test above."""
+    for file in PACKAGE.rglob("*.py"):
+        text = " ".join(file.read_text(encoding="utf-8").split())
+        for sentence in re.findall(r"[^.]*\b[Ee]qs?\. [^\[]{1,40}\[DRBPN\]", text):
+            assert CITATION.search(sentence), f"{file}: {sentence[-80:]}"
+
+
+# ------------------------------------------------------------------------------------------- api.md
+@pytest.mark.parametrize("module", ["torchrl_drbpn", "torchrl_drbpn.functional"])
+def test_the_public_names_are_listed_and_no_other(module):
+    text = (DOCS / "api.md").read_text(encoding="utf-8")
+    assert text.index("## `torchrl_drbpn`\n") < text.index("## `torchrl_drbpn.functional`\n")
+    listed = dict(zip(["torchrl_drbpn", "torchrl_drbpn.functional"], tables(DOCS / "api.md"),
+                      strict=True))  # fmt: skip
+    names = [quoted(row[0])[0] for row in listed[module][1:]]
+    assert len(names) == len(set(names))
+    assert set(names) == set(importlib.import_module(module).__all__)
+    assert all(len(row[1]) > 10 for row in listed[module][1:])
+
+
+def test_notation_names_the_keys_that_are_read_and_written():
+    package = importlib.import_module(PACKAGE.name)
+    module = package.BeliefFilterModule(package.BeliefFilter(3, 2))
+    losses = importlib.import_module("torchrl_drbpn.objectives")
+    text = (DOCS / "notation.md").read_text(encoding="utf-8")
+    keys = [*module.in_keys, *module.out_keys, *losses.BeliefModelLoss().out_keys]
+    transforms = {  # required arguments, where there are some
+        "ObservationMissingness": ("mcar", 0.5),
+        "ObservationNoise": (0.1,),
+        "SensorReduction": ([0],),
+        "RunningReturnScale": (0.99,),
+    }
+    room = importlib.import_module("torchrl_drbpn.transforms")
+    for name in room.__all__:
+        if name != "seed_env":
+            assert f"`{name}`" in text, name
+            transform = getattr(room, name)(*transforms.get(name, ()))
+            keys += [*transform.in_keys, *transform.out_keys, *getattr(transform, "state_keys", [])]
+    for key in keys:
+        spelt = key if isinstance(key, str) else str(tuple(key)).replace("'", '"')
+        assert f"`{spelt}`" in text, key
+
+
+# -------------------------------------------------------------------------------------------- links
+def slug(heading: str) -> str:
+    kept = re.sub(r"[^\w\- ]", "", heading.strip().lower())
+    return kept.replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids(PAGES))
+def test_every_relative_link_leads_somewhere(page):
+    prose = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = page if not path else page.parent / path
+        assert file.exists(), f"{page.name}: {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in map(slug, headings), f"{page.name}: {target}"
+
+
+# -------------------------------------------------------------------------------------------- guide
+def test_the_blocks_of_the_guide_are_the_script_and_all_of_it():
+    blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
+    rest = SCRIPT.read_text(encoding="utf-8")
+    left = []
+    for block in blocks:
+        before, found, rest = rest.partition(block)
+        assert found, f"not in the script at its place:\n{block}"
+        left.append(before)
+    module_docstring, *between = left
+    assert isinstance(ast.parse(module_docstring).body[0], ast.Expr)
+    assert len(ast.parse(module_docstring).body) == 1
+    assert not "".join([*between, rest]).strip(), "the page leaves out a part of the script"
+
+
+def test_the_script_of_the_guide_imports_core_dependencies_alone():
+    tree = ast.parse(SCRIPT.read_text(encoding="utf-8"))
+    modules = {
+        name.split(".")[0]
+        for node in ast.walk(tree)
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    assert modules <= {"torch", "tensordict", "torchrl", "torchrl_drbpn"}
+
+
+@pytest.mark.slow
+def test_the_script_of_the_guide_runs_elsewhere_and_learns(tmp_path):
+    shutil.copy(SCRIPT, tmp_path)
+    done = subprocess.run(
+        [sys.executable, SCRIPT.name],
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    first, last = map(float, re.findall(r"20 episodes ([\d.]+).*last 20 ([\d.]+)", done.stdout)[0])
+    assert last > 3 * first
+    assert re.findall(r"missing 0\.(\d\d)", done.stdout)[0] in {"28", "29", "30", "31", "32"}

@@ -1,0 +1,529 @@
+"""What `DRBPNLoss` is held to: a loss's duties, and eq. (13) [DRBPN] from one filter pass.
+
+PPO's terms are those of TorchRL's ClipPPOLoss on the same beliefs, to the last bit. The model term
+counts every received observation once, x_{T+1} included, however a rollout is cut into sequences.
+Data come from TorchRL's collector: terminations and truncations inside rows, rows that begin in
+mid-episode.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import oracles
+import pytest
+import torch
+from agents import (
+    ACTION,
+    OBS,
+    TIME,
+    Agent,
+    add_advantages,
+    collect,
+    make_agent,
+    make_filter,
+)
+from contracts import LossContract
+from tensordict import TensorDict, TensorDictBase
+from torchrl.modules import GRUModule, set_recurrent_mode
+from torchrl.modules.tensordict_module.rnn import recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+
+from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss
+
+PPO_TERMS = ("loss_objective", "loss_critic", "loss_entropy")
+
+
+def make_belief_agent(dtype: torch.dtype = torch.float64, features: str = "features") -> Agent:
+    belief = BeliefFilterModule(make_filter(OBS, ACTION, dtype))
+    return make_agent(belief, belief.feature_dim, features=features, dtype=dtype)
+
+
+@functools.cache
+def rollout(dtype: torch.dtype = torch.float64) -> TensorDictBase:
+    """Fresh data of `make_belief_agent`, with advantages; cloned by `make_data`."""
+    agent = make_belief_agent(dtype)
+    return add_advantages(agent, collect(agent, dtype=dtype))
+
+
+def make_data(dtype: torch.dtype = torch.float64) -> TensorDictBase:
+    data = rollout(dtype).clone()
+    final = torch.zeros(*data.shape, 1, dtype=torch.bool)
+    final[:, -1] = True
+    return data.set("final", final)
+
+
+def make_ppo(agent: Agent, **kwargs) -> ClipPPOLoss:
+    kwargs = {"normalize_advantage": True, **kwargs}
+    return ClipPPOLoss(agent.actor, agent.critic, **kwargs)
+
+
+def make_loss(agent: Agent | None = None, *, ppo: dict | None = None, **kwargs) -> DRBPNLoss:
+    agent = make_belief_agent() if agent is None else agent
+    model = kwargs.pop("model", None) or BeliefModelLoss()
+    return DRBPNLoss(agent.belief, make_ppo(agent, **(ppo or {})), model, **kwargs)
+
+
+def as_dtype(data: TensorDictBase, dtype: torch.dtype) -> TensorDictBase:
+    return data.apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
+
+
+def cut(data: TensorDictBase, length: int) -> TensorDictBase:
+    """Sequences cut from the rows of a rollout, [rows * time / length, length]."""
+    return data.reshape(-1).reshape(-1, length)
+
+
+# ------------------------------------------------------------------------------------------- duties
+class TestContract(LossContract):
+    def make_loss(self, **kwargs):
+        # analytic entropy: nothing is sampled in the loss
+        return make_loss(make_belief_agent(torch.float32), **kwargs)
+
+    def make_loss_data(self, dtype=torch.float32):
+        return as_dtype(make_data(torch.float32), dtype)
+
+    def test_losses_that_are_held_are_reduced_as_they_were_told(self):
+        for reduction in ("none", "mean", "sum"):
+            loss = make_loss(
+                ppo={"reduction": reduction}, model=BeliefModelLoss(reduction=reduction)
+            )
+            data = make_data()
+            out = loss(data)
+            for key in (*PPO_TERMS, "loss_model"):
+                shape = out[key].squeeze(-1).shape if reduction == "none" else out[key].shape
+                assert shape == (data.shape if reduction == "none" else ()), key
+
+
+class TestContractWithoutAModel(LossContract):
+    """A GRU in the filter's place."""
+
+    def make_loss(self, **kwargs):
+        return make_gru_loss()[1]
+
+    def make_loss_data(self, dtype=torch.float32):
+        agent, _ = make_gru_loss()
+        return as_dtype(add_advantages(agent, collect(agent, dtype=torch.float32)), dtype)
+
+
+def make_gru_loss() -> tuple[Agent, DRBPNLoss]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        gru = GRUModule(input_size=OBS, hidden_size=6, in_key="observation", out_key="features")
+    agent = make_agent(gru, 6, dtype=torch.float32)
+    return agent, DRBPNLoss(gru, make_ppo(agent), None)
+
+
+# ---------------------------------------------------------------------------------------- one pass
+def test_one_pass_over_time_and_one_step_for_the_last_observations():
+    agent = make_belief_agent()
+    loss, data = make_loss(agent), make_data()
+    calls = []
+    agent.belief.register_forward_hook(
+        lambda module, args, out: calls.append((recurrent_mode(), tuple(out.shape)))
+    )
+    loss(data)
+    ends = (data["next", "done"] | data["final"]).sum().item()
+    assert calls == [(True, tuple(data.shape)), (False, (ends,))]
+
+
+def test_what_the_collector_wrote_of_the_belief_is_not_read():
+    loss, data = make_loss(), make_data()
+    expected = loss(data)
+    stale = data.clone()
+    stale["features"].fill_(torch.nan)
+    for key in ("mean", "log_likelihood"):
+        stale["belief", key].fill_(torch.nan)
+    stale["next", "recurrent", "mean"].fill_(torch.nan)
+    out = loss(stale)
+    for key, value in expected.items():
+        assert torch.equal(out[key], value), key
+
+
+# ------------------------------------------------------------------------- PPO as if it stood alone
+def reference(agent: Agent, data: TensorDictBase) -> tuple[TensorDictBase, list]:
+    """ClipPPOLoss after a pass of the belief module, and its gradients by all parameters."""
+    beliefs = data.copy()
+    with set_recurrent_mode(True):
+        agent.belief(beliefs)
+    out = make_ppo(agent)(beliefs)
+    return out, gradients(agent, sum(out[key] for key in PPO_TERMS))
+
+
+def gradients(agent: Agent, total: torch.Tensor) -> list[torch.Tensor | None]:
+    parameters = [
+        *agent.belief.parameters(),
+        *agent.actor.parameters(),
+        *agent.critic.parameters(),
+    ]
+    grads = torch.autograd.grad(total, parameters, allow_unused=True, retain_graph=True)
+    return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, grads, strict=True)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("length", [TIME, 6])
+def test_with_model_coeff_0_everything_is_ppo_to_the_last_bit(dtype, length):
+    agent, data = make_belief_agent(dtype), cut(make_data(dtype), length)
+    expected, expected_grads = reference(agent, data)
+    out = make_loss(agent, model_coeff=0.0)(data)
+    for key, value in expected.items():
+        assert torch.equal(out[key], value), key
+    assert out["loss_model"] == 0
+    total = sum(value for key, value in out.items() if key.startswith("loss"))
+    for received, wanted in zip(gradients(agent, total), expected_grads, strict=True):
+        assert torch.equal(received, wanted)
+    assert any(grad.any() for grad in expected_grads[: len(list(agent.belief.parameters()))])
+
+
+def test_the_model_term_leaves_the_ppo_terms_as_they_were():
+    agent, data = make_belief_agent(), make_data()
+    expected, expected_grads = reference(agent, data)
+    out = make_loss(agent, model_coeff=3.0)(data)
+    for key, value in expected.items():
+        assert torch.equal(out[key], value), key
+    ppo = sum(out[key] for key in PPO_TERMS)
+    for received, wanted in zip(gradients(agent, ppo), expected_grads, strict=True):
+        assert torch.equal(received, wanted)
+
+
+def test_the_model_term_comes_out_weighted_and_its_metric_does_not():
+    agent, data = make_belief_agent(), make_data()
+    loss = make_loss(agent, model_coeff=1.0)
+    out = loss(data)
+    assert torch.equal(out["log_likelihood"], -out["loss_model"].detach())
+    loss.model_coeff = 0.3
+    changed = loss(data)
+    torch.testing.assert_close(changed["loss_model"], 0.3 * out["loss_model"])
+    assert torch.equal(changed["log_likelihood"], out["log_likelihood"])
+    assert loss.state_dict()["model_coeff"] == pytest.approx(0.3)
+
+
+def test_a_detached_belief_learns_from_the_model_alone():
+    agent, data = make_belief_agent(), make_data()
+    count = len(list(agent.belief.parameters()))
+    attached = make_loss(agent)(data)
+    detached = make_loss(agent, detach_belief=True)(data)
+    for key, value in attached.items():
+        assert torch.equal(detached[key], value), key
+    ppo = gradients(agent, sum(detached[key] for key in PPO_TERMS))
+    assert not any(grad.any() for grad in ppo[:count])
+    # the heads learn as before, and so does the filter from the model
+    before = gradients(agent, sum(attached[key] for key in PPO_TERMS))
+    for received, wanted in zip(ppo[count:], before[count:], strict=True):
+        assert torch.equal(received, wanted)
+    for received, wanted in zip(
+        gradients(agent, detached["loss_model"]),
+        gradients(agent, attached["loss_model"]),
+        strict=True,
+    ):
+        assert torch.equal(received, wanted)
+
+
+@pytest.mark.parametrize("length", [TIME, 6])
+def test_on_fresh_data_the_ratio_and_the_effective_sample_size_are_one(length):
+    data = make_data()
+    assert data["is_init"][:, 1:].any()
+    assert (data["recurrent", "age"][:, 0] > 0).any()
+    out = make_loss()(cut(data, length))
+    torch.testing.assert_close(out["ESS"], torch.ones_like(out["ESS"]), rtol=1e-9, atol=0)
+    assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
+    assert out["mean_ratio"].item() == pytest.approx(1, abs=1e-4)
+    assert out["clip_fraction"] == 0
+
+
+# --------------------------------------------------------------------- every observation counts once
+def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
+    """Log-likelihood of every received observation, and entries, from the row-deleting oracle.
+
+    Received are: the frame that a row begins with, the frame after every action, and the first
+    frame of every episode.
+    """
+    model = agent.belief.filter
+    f = model.transition.mean_network()
+    transition = oracles.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)
+    H, R, Q = model.emission.matrix, model.emission.cov(), model.transition.cov()
+    total, entries = torch.zeros((), dtype=torch.float64), 0
+
+    def receive(belief, frame):
+        nonlocal total, entries
+        action = frame["previous_action"].to(torch.float64)
+        offset = model.emission.action_matrix @ action + model.emission.offset
+        step = (*belief, frame["observation"], frame["observed"], H, R, offset)
+        total = total + oracles.log_likelihood(*step)
+        entries += int(frame["observed"].sum())
+        return oracles.update(*step)
+
+    def move(belief, frame):
+        action = frame["previous_action"].to(torch.float64)
+        return oracles.predict(*belief, transition, Q, action)
+
+    episodes = 0
+    for row in data.unbind(0):
+        belief = None
+        for t, frame in enumerate(row.unbind(0)):
+            if frame["is_init"]:
+                belief = receive((model.initial_mean, model.initial_cov), frame)
+                episodes += 1
+            elif t == 0:
+                stored = (frame["recurrent", "mean"], Q)
+                belief = receive(move(stored, frame), frame)
+            belief = receive(move(belief, frame["next"]), frame["next"])
+    assert episodes > 3
+    return total.detach(), entries
+
+
+@pytest.mark.parametrize("length", [TIME, 12, 6, 1])
+def test_every_received_observation_counts_once_however_the_rollout_is_cut(length):
+    agent, data = make_belief_agent(), make_data()
+    assert data["next", "terminated"][:, :-1].any()
+    assert data["next", "truncated"][:, :-1].any()
+    expected, entries = counted(agent, data)
+    loss = make_loss(agent, model=BeliefModelLoss(reduction="sum"))
+    sequences = cut(data, length)
+    total, per_entry = torch.zeros((), dtype=torch.float64), []
+    for minibatch in sequences.split(sequences.shape[0] // 3):
+        out = loss(minibatch)
+        total = total - out["loss_model"].detach()
+        per_entry.append((out["loss_model"], out["log_likelihood"]))
+    torch.testing.assert_close(total, expected, rtol=1e-10, atol=1e-10)
+    counts = sum((-value / metric).item() for value, metric in per_entry)
+    assert counts == pytest.approx(entries, abs=1e-6)
+
+
+def test_final_adds_the_observation_after_the_cut_and_nothing_else():
+    agent, data = make_belief_agent(), make_data()
+    loss = make_loss(agent, model=BeliefModelLoss(reduction="none"))
+    each = loss(data)["loss_model"]
+    without = loss(data.exclude("final"))["loss_model"]
+    differs = ~torch.isclose(each, without, rtol=1e-9, atol=1e-9)
+    goes_on = ~data["next", "done"][:, -1, 0]
+    assert goes_on.any()
+    assert torch.equal(differs[:, -1], goes_on & data["next", "observed"][:, -1].any(-1))
+    assert not differs[:, :-1].any()
+
+
+def test_the_next_observation_is_predicted_from_the_live_belief_with_its_gradient():
+    agent, data = make_belief_agent(), make_data()
+    with torch.no_grad():
+        for parameter in agent.belief.parameters():
+            parameter += 0.05  # no longer the filter that collected
+    data = data[:1]
+    data["is_init"][:, 0] = True
+    data["recurrent", "age"][:, 0] = 0
+    expected, _ = counted_live(agent, data)
+    out = make_loss(agent, model=BeliefModelLoss(reduction="sum"))(data)
+    torch.testing.assert_close(-out["loss_model"], expected, rtol=1e-10, atol=1e-10)
+    for received, wanted in zip(
+        gradients(agent, -out["loss_model"]), gradients(agent, expected), strict=True
+    ):
+        torch.testing.assert_close(received, wanted, rtol=1e-8, atol=1e-8)
+
+
+def counted_live(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
+    """The same sum with every frame in one long row and its gradient kept."""
+    model = agent.belief.filter
+    f = model.transition.mean_network()
+    transition = oracles.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)
+    frames, resets = [], []
+    for t, frame in enumerate(data[0].unbind(0)):
+        if frame["is_init"]:
+            frames.append(frame)
+            resets.append(True)
+        assert t > 0 or frame["is_init"]
+        frames.append(frame["next"])
+        resets.append(False)
+
+    def stack(key: str) -> torch.Tensor:
+        return torch.stack([frame[key] for frame in frames])[None]
+
+    out = oracles.filter_sequence(
+        observation=stack("observation"),
+        observed=stack("observed"),
+        previous_action=stack("previous_action").to(torch.float64),
+        reset=torch.tensor(resets)[None],
+        start_mean=torch.zeros(1, model.state_dim, dtype=torch.float64),
+        initial_mean=model.initial_mean,
+        initial_cov=model.initial_cov,
+        transition=transition,
+        transition_cov=model.transition.cov(),
+        matrix=model.emission.matrix,
+        noise=model.emission.cov(),
+        action_matrix=model.emission.action_matrix,
+        bias=model.emission.offset,
+    )
+    return out.log_likelihood.sum(), int(stack("observed").sum())
+
+
+def test_a_rollout_without_an_end_adds_nothing():
+    agent, data = make_belief_agent(), make_data()[:, :1].exclude("final")
+    data["next", "done"].fill_(False)
+    out = make_loss(agent, model=BeliefModelLoss(reduction="none"))(data)
+    beliefs = data.copy()
+    with set_recurrent_mode(True):
+        agent.belief(beliefs)
+    torch.testing.assert_close(out["loss_model"], -beliefs["belief", "log_likelihood"])
+
+
+def test_nothing_observed_at_all_is_a_finite_zero():
+    agent, data = make_belief_agent(), make_data()
+    for key in ("observed", ("next", "observed")):
+        data[key].fill_(False)
+    for normalize in ("entry", "step"):
+        loss = make_loss(agent, model=BeliefModelLoss(normalize=normalize))
+        out = loss(data)
+        assert out["loss_model"] == 0
+        total = sum(value for key, value in out.items() if key.startswith("loss"))
+        assert all(grad.isfinite().all() for grad in gradients(agent, total))
+
+
+# --------------------------------------------------------------------------------------------- keys
+def test_renamed_entries_reach_the_held_losses():
+    agent, data = make_belief_agent(), make_data()
+    expected = make_loss(agent)(data)
+    loss = make_loss(agent)
+    for name, old, new in (
+        ("advantage", "advantage", "adv"),
+        ("value_target", "value_target", ("targets", "value")),
+        ("sample_log_prob", "action_log_prob", "logp"),
+        ("final", "final", "cut"),
+        ("done", ("next", "done"), ("next", "over")),
+    ):
+        data.rename_key_(old, new)
+        loss.set_keys(**{name: new})
+    out = loss(data)
+    for key, value in expected.items():
+        assert torch.equal(out[key], value), key
+    assert loss.ppo_loss.tensor_keys.done == "over"
+    assert loss.model_loss.tensor_keys.done == ("next", "over")
+    loss.set_keys(done=None)
+    assert loss.ppo_loss.tensor_keys.done == "done"
+    assert loss.model_loss.tensor_keys.done == ("next", "done")
+
+
+def test_a_filter_with_keys_of_its_own_is_served():
+    plain, data = make_belief_agent(), make_data()
+    expected = make_loss(plain, detach_belief=True)(data)
+    belief = BeliefFilterModule(
+        make_filter(OBS, ACTION, torch.float64),
+        in_keys={"observed": ("agent", "mask"), "is_init": "first"},
+        out_keys={"features": "embed", ("belief", "log_likelihood"): "ll"},
+    )
+    agent = make_agent(belief, belief.feature_dim, features="embed")
+    for old, new in (
+        ("observed", ("agent", "mask")),
+        (("next", "observed"), ("next", "agent", "mask")),
+        ("is_init", "first"),
+        (("next", "is_init"), ("next", "first")),
+    ):
+        data.rename_key_(old, new)
+    loss = make_loss(agent, detach_belief=True)
+    loss.set_keys(
+        features="embed",
+        log_likelihood="ll",
+        next_log_likelihood=("next", "ll"),
+        observed=("agent", "mask"),
+        next_observed=("next", "agent", "mask"),
+        is_init="first",
+    )
+    out = loss(data)
+    for key, value in expected.items():
+        assert torch.equal(out[key], value), key
+
+
+# --------------------------------------------------------------------------------------- parameters
+def test_the_parameters_are_those_of_the_modules():
+    agent = make_belief_agent()
+    loss = make_loss(agent)
+    mine = {id(p) for p in loss.parameters()}
+    theirs = {
+        id(p) for part in (agent.belief, agent.actor, agent.critic) for p in part.parameters()
+    }
+    assert mine == theirs
+    assert len(mine) == len(list(loss.parameters()))
+    # an update of the loss's parameters reaches the collector's policy
+    before = agent.policy(make_data()[:, 0].select(*agent.policy.in_keys))["features"]
+    with torch.no_grad():
+        for parameter in loss.parameters():
+            parameter += 0.1
+    after = agent.policy(make_data()[:, 0].select(*agent.policy.in_keys))["features"]
+    assert not torch.equal(before, after)
+
+
+def test_reset_parameters_start_the_whole_agent_again():
+    agent = make_belief_agent()
+    loss = make_loss(agent)
+    loss.reset_parameters_recursive()
+    fresh, model = make_filter(OBS, ACTION, torch.float64, perturb=False), agent.belief.filter
+    for name in ("initial_mean", "initial_cov"):
+        assert torch.equal(getattr(model, name), getattr(fresh, name)), name
+    assert torch.equal(model.emission.matrix, fresh.emission.matrix)
+    assert torch.equal(model.emission.cov(), fresh.emission.cov())
+    assert torch.equal(model.transition.cov(), fresh.transition.cov())
+
+
+def test_a_few_updates_lower_the_total_loss():
+    agent, data = make_belief_agent(), make_data()
+    loss = make_loss(agent)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    totals = []
+    for _ in range(15):
+        out = loss(data)
+        total = sum(value for key, value in out.items() if key.startswith("loss"))
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        totals.append((total.item(), out["loss_model"].item()))
+    assert totals[-1][0] < totals[0][0]
+    assert totals[-1][1] < totals[0][1]
+
+
+# ---------------------------------------------------------------------------------------- bad input
+def test_missing_advantages_are_named():
+    with pytest.raises(KeyError, match="`advantage` is not in the tensordict: compute advantages"):
+        make_loss()(make_data().exclude("advantage"))
+
+
+def test_a_negative_model_coefficient_is_refused():
+    with pytest.raises(ValueError, match="`model_coeff` must be at least 0, got -1"):
+        make_loss(model_coeff=-1.0)
+
+
+def test_an_unknown_key_is_refused_with_those_it_accepts():
+    with pytest.raises(ValueError, match="'advantages'.*DRBPNLoss; it accepts .*'advantage'"):
+        make_loss().set_keys(advantages="a")
+
+
+def test_a_belief_module_without_a_likelihood_cannot_have_a_model_loss():
+    agent, _ = make_gru_loss()
+    data = TensorDict.stack([make_data(torch.float32)])[0]
+    data["recurrent_state"] = torch.zeros(*data.shape, 1, 6)
+    loss = DRBPNLoss(agent.belief, make_ppo(agent), BeliefModelLoss())
+    with pytest.raises(KeyError, match="run the belief module on it"):
+        loss(data.exclude("belief", ("next", "belief")))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("observed", torch.ones(3, TIME, OBS), "`observed` must be bool of shape"),
+        ("observed", torch.ones(3, TIME, 2, dtype=torch.bool), "`observed` must be bool of shape"),
+        ("observation", torch.ones(3, TIME, 9, dtype=torch.float64), "another environment"),
+        ("observation", torch.ones(3, TIME, OBS), "DoubleToFloat"),
+    ],
+)
+def test_bad_data_are_refused_as_the_filter_refuses_them(key, value, message):
+    with pytest.raises(ValueError, match=message):
+        make_loss()(make_data().set(key, value))
+
+
+@pytest.mark.parametrize("model_coeff", [0.0, 1.0])
+def test_functional_or_not_gives_the_same_terms_and_gradients(model_coeff):
+    agent, data = make_belief_agent(), make_data()
+    outs = [
+        make_loss(agent, functional=functional, model_coeff=model_coeff)(data)
+        for functional in (True, False)
+    ]
+    for key, value in outs[0].items():
+        assert torch.equal(outs[1][key], value), key
+    totals = [sum(v for k, v in out.items() if k.startswith("loss")) for out in outs]
+    for one, other in zip(*(gradients(agent, total) for total in totals), strict=True):
+        assert torch.equal(one, other)

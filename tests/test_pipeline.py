@@ -1,0 +1,157 @@
+"""A belief filter in a GRU's place: TorchRL's collector, GAE and ClipPPOLoss, one code for both.
+
+Only the constructor and the keys differ. On fresh data, before any update, the importance ratio is
+1 though episodes end inside rows and rows begin in mid-episode; and GAE through the module sees the
+values of the beliefs that the collector stored.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+import torch
+from agents import ACTION, ENVS, OBS, TIME, Agent, collect, make_agent, make_env, make_filter
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs.utils import step_mdp
+from torchrl.modules import GRUModule, set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+from torchrl.objectives.value.functional import generalized_advantage_estimate
+
+from torchrl_drbpn import BeliefFilterModule
+
+GAMMA, LMBDA = 0.99, 0.95
+DTYPE = torch.float32
+
+
+def gru() -> GRUModule:
+    return GRUModule(
+        input_size=OBS,
+        hidden_size=6,
+        in_keys=["observation", "recurrent_state", "is_init"],
+        out_keys=["features", ("next", "recurrent_state")],
+    )
+
+
+def belief_filter() -> BeliefFilterModule:
+    return BeliefFilterModule(make_filter(OBS, ACTION, DTYPE, state=6))
+
+
+BOTH = pytest.mark.parametrize("make_module", [gru, belief_filter])
+
+
+@functools.cache
+def agent_and_rollout(make_module) -> tuple[Agent, TensorDictBase]:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        agent = make_agent(make_module(), 6, dtype=DTYPE)
+    return agent, collect(agent, dtype=DTYPE)
+
+
+def make_gae(agent: Agent) -> GAE:
+    return GAE(
+        gamma=GAMMA,
+        lmbda=LMBDA,
+        value_network=agent.value,
+        shifted=False,
+        deactivate_vmap=True,
+    )
+
+
+@BOTH
+def test_on_fresh_data_the_ratio_and_the_effective_sample_size_are_one(make_module):
+    agent, data = agent_and_rollout(make_module)
+    data = data.clone()
+    assert data["is_init"][:, 1:].any()
+    assert not data["is_init"][:, 0].all()
+    with set_recurrent_mode(True), torch.no_grad():
+        make_gae(agent)(data)
+    out = ClipPPOLoss(agent.policy, agent.value)(data)
+    torch.testing.assert_close(out["ESS"], torch.ones_like(out["ESS"]), rtol=1e-4, atol=0)
+    assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
+    assert out["mean_ratio"].item() == pytest.approx(1, abs=1e-4)
+    assert out["kl_approx"].item() == pytest.approx(0, abs=1e-4)
+
+
+@BOTH
+def test_gae_sees_the_values_of_stored_and_next_beliefs(make_module):
+    agent, data = agent_and_rollout(make_module)
+    through = data.clone()
+    with set_recurrent_mode(True), torch.no_grad():
+        make_gae(agent)(through)
+
+    with torch.no_grad():
+        value = agent.critic.module(data["features"])
+        # one step from the stored state at t + 1, for all steps at once
+        following = step_mdp(data, keep_other=False).select(*agent.belief.in_keys)
+        with set_recurrent_mode(False):
+            next_value = agent.critic.module(agent.belief(following)["features"])
+        advantage, target = generalized_advantage_estimate(
+            GAMMA,
+            LMBDA,
+            value,
+            next_value,
+            data["next", "reward"],
+            data["next", "done"],
+            data["next", "terminated"],
+        )
+    assert data["next", "truncated"][:, :-1].any()
+    scale = advantage.abs().max().item()
+    torch.testing.assert_close(through["advantage"], advantage, rtol=1e-5, atol=1e-5 * scale)
+    torch.testing.assert_close(through["value_target"], target, rtol=1e-5, atol=1e-5 * scale)
+
+
+@BOTH
+def test_it_learns_over_minibatches_of_sequences(make_module):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        agent = make_agent(make_module(), 6, dtype=DTYPE)
+        gae, loss = make_gae(agent), ClipPPOLoss(agent.policy, agent.value)
+        before = [parameter.detach().clone() for parameter in loss.parameters()]
+        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+        collector = Collector(
+            make_env(DTYPE),
+            agent.policy,
+            frames_per_batch=ENVS * TIME,
+            total_frames=2 * ENVS * TIME,
+            auto_register_policy_transforms=True,
+        )
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(ENVS * TIME // 6),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=4,
+        )
+        try:
+            for data in collector:
+                with set_recurrent_mode(True), torch.no_grad():
+                    gae(data)
+                buffer.empty()
+                buffer.extend(data.reshape(-1).reshape(-1, 6))
+                for minibatch in buffer:
+                    assert minibatch.shape == (4, 6)
+                    out = loss(minibatch)
+                    total = out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]
+                    optimizer.zero_grad()
+                    total.backward()
+                    optimizer.step()
+                    assert total.isfinite()
+        finally:
+            collector.shutdown()
+    for parameter, old in zip(loss.parameters(), before, strict=True):
+        assert parameter.isfinite().all()
+        assert parameter.grad is not None
+        assert not torch.equal(parameter, old)
+
+
+def test_without_its_primer_the_filter_says_so_where_a_gru_is_silent():
+    agent = make_agent(belief_filter(), 6, dtype=DTYPE)
+    with pytest.warns(UserWarning, match=r"make_tensordict_primer\(\)"), torch.no_grad():
+        data = make_env(DTYPE).rollout(4, agent.policy, break_when_any_done=False)
+    # nothing is remembered: every step starts from the initial belief
+    with set_recurrent_mode(False), torch.no_grad():
+        step = data[:, 2].select("observation", "observed", "previous_action", "is_init")
+        alone = agent.belief(step)["features"]
+    assert torch.equal(alone, data["features"][:, 2])
