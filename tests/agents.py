@@ -15,6 +15,7 @@ from contracts import with_belief_entries
 from tensordict import TensorDictBase
 from tensordict.nn import (
     NormalParamExtractor,
+    ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictModuleBase,
     TensorDictSequential,
@@ -44,8 +45,8 @@ class Agent:
     critic: ValueOperator
 
     @property
-    def policy(self) -> TensorDictSequential:
-        return TensorDictSequential(self.belief, self.actor)
+    def policy(self) -> ProbabilisticTensorDictSequential:
+        return ProbabilisticTensorDictSequential(self.belief, *self.actor.module)
 
     @property
     def value(self) -> TensorDictSequential:

@@ -131,7 +131,11 @@ def test_out_keys_as_a_list_or_a_dict_choose_what_is_written():
     data = with_state(make_frames((3,)), OBS)
     module = BeliefFilterModule(make_filter(dtype=torch.float64), out_keys=["features"])
     out = module(data.clone())
-    assert module.out_keys == ["features", ("next", "recurrent", "mean"), ("next", "recurrent", "age")]
+    assert module.out_keys == [
+        "features",
+        ("next", "recurrent", "mean"),
+        ("next", "recurrent", "age"),
+    ]
     assert ("belief", "mean") not in out.keys(True)
     module = BeliefFilterModule(
         make_filter(dtype=torch.float64),
@@ -194,14 +198,17 @@ def test_optional_entries_are_not_computed_where_not_asked_for(monkeypatch):
     out = module(data)
     for key in OPTIONAL:
         assert key not in out.keys(True)
-    assert module.filter.step(
-        data["recurrent", "mean"],
-        None,
-        data["previous_action"],
-        data["observation"],
-        data["observed"],
-        data["is_init"].squeeze(-1),
-    ).cov is None
+    assert (
+        module.filter.step(
+            data["recurrent", "mean"],
+            None,
+            data["previous_action"],
+            data["observation"],
+            data["observed"],
+            data["is_init"].squeeze(-1),
+        ).cov
+        is None
+    )
 
 
 def test_mean_cov_features_are_the_mean_and_the_lower_triangle():

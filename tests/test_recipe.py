@@ -8,6 +8,7 @@ checkpoint that can't be used is answered with one line.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -128,25 +129,20 @@ def test_evaluation_leaves_the_global_generator_and_the_statistics_alone() -> No
     settings = read_settings(make_config(*SMOKE))
     training = assemble(settings)
     train_rollout(training, settings)
-    before = training_state(training)
-    before = torch.load(_saved(before), weights_only=True)
+    before = _copy(training_state(training))
     env = make_evaluation_environment(settings, training.belief, training.agent, episodes=3)
     result = evaluate(training.agent.policy, env, mode="sampled", seed=5, statistics=training.env)
     assert result is not None
     assert len(result.returns) == len(result.lengths) == 3
     assert evaluate(training.agent.policy, env, mode="mean", seed=5, stop=lambda: True) is None
-    assert (
-        differences(before, torch.load(_saved(training_state(training)), weights_only=True)) == []
-    )
+    assert differences(before, _copy(training_state(training))) == []
 
 
-def _saved(state: dict[str, Any]) -> Any:
-    import io
-
+def _copy(state: dict[str, Any]) -> Any:
     file = io.BytesIO()
     torch.save(state, file)
     file.seek(0)
-    return file
+    return torch.load(file, weights_only=True)
 
 
 # Stopped and resumed --------------------------------------------------------------------------

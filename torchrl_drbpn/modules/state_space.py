@@ -63,13 +63,13 @@ class _Covariance(nn.Module):
         _check_choice("cov", kind, ("diag", "full"))
         _check_std(init_std, min_std)
         self.kind, self.init_std, self.min_std = kind, init_std, min_std
-        raw = torch.zeros(dim, device=device, dtype=dtype)
+        like = torch.zeros(dim, device=device, dtype=dtype)
         if kind == "diag":
-            raw = raw + inverse_softplus(torch.tensor(init_std - min_std, device=device))
+            raw = like + inverse_softplus(like.new_tensor(init_std - min_std))
         else:
-            spread = torch.tensor(init_std**2 - min_std**2, device=device).sqrt()
-            raw = torch.diag_embed(raw + inverse_softplus(spread))
-        self.raw = nn.Parameter(raw.to(dtype or torch.get_default_dtype()))
+            spread = like.new_tensor(init_std**2 - min_std**2).sqrt()
+            raw = torch.diag_embed(like + inverse_softplus(spread))
+        self.raw = nn.Parameter(raw)
 
     def reset_parameters(self) -> None:
         """Put the standard deviations back to ``init_std``."""

@@ -1,0 +1,412 @@
+"""What `BeliefFilter` is held to: the textbook by hand, any transition, and clear refusals.
+
+`step` and `forward` take tensors. They equal a hand loop of predict and update whatever the kind of
+Q, of R, of transition and of form; the initial belief enters where `reset` says so; a missing entry
+is a deleted row; covariances come only where asked for.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from typing import NamedTuple
+
+import oracles
+import pytest
+import torch
+from agents import make_filter
+from contracts import saved
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.modules import set_recurrent_mode
+
+from torchrl_drbpn import (
+    BeliefFilter,
+    BeliefFilterModule,
+    GaussianTransition,
+    LinearGaussianEmission,
+    functional,
+)
+
+OBS, ACTION = 5, 2
+F64 = torch.float64
+
+
+class Inputs(NamedTuple):
+    mean: Tensor
+    cov: Tensor | None
+    previous_action: Tensor
+    observation: Tensor
+    observed: Tensor
+    reset: Tensor
+
+
+def make_inputs(state: int, batch: tuple[int, ...] = (3,), time: int = 6, seed: int = 0) -> Inputs:
+    """Sequences with a reset inside one row, a frame of nothing and a frame of everything."""
+    g = torch.Generator().manual_seed(seed)
+    shape = (*batch, time)
+    observed = torch.rand(*shape, OBS, generator=g) < 0.6
+    observed[..., 1, :] = False
+    observed[..., 2, :] = True
+    observation = torch.randn(*shape, OBS, generator=g, dtype=F64)
+    reset = torch.zeros(*shape, dtype=torch.bool)
+    reset[..., 0, 0] = True
+    reset[..., 1, 3] = True
+    return Inputs(
+        torch.randn(*batch, state, generator=g, dtype=F64),
+        None,
+        torch.randn(*shape, ACTION, generator=g, dtype=F64),
+        torch.where(observed, observation, 0.0),
+        observed,
+        reset,
+    )
+
+
+class SineTransition(nn.Module):
+    """A transition of the user's own: s' = s + sin(W s) + C a, Q growing with the state."""
+
+    def __init__(self, state: int) -> None:
+        super().__init__()
+        g = torch.Generator().manual_seed(3)
+        self.state_dim, self.action_dim = state, ACTION
+        self.W = nn.Parameter(torch.randn(state, state, generator=g, dtype=F64))
+        self.C = nn.Parameter(torch.randn(state, ACTION, generator=g, dtype=F64))
+
+    def forward(self, mean: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        moved = mean + torch.sin(mean @ self.W.mT) + action @ self.C.mT
+        return moved, torch.diag_embed(0.1 + 0.1 * mean.square())
+
+
+def by_hand(model: BeliefFilter, inputs: Inputs) -> oracles.Sequence:
+    """The row-deleting oracle with this filter's own transition."""
+    emission = model.emission
+    return oracles.filter_sequence(
+        observation=inputs.observation,
+        observed=inputs.observed,
+        previous_action=inputs.previous_action,
+        reset=inputs.reset,
+        start_mean=inputs.mean,
+        initial_mean=model.initial_mean,
+        initial_cov=model.initial_cov,
+        transition=lambda m, a: model.transition(m, a)[0],
+        transition_cov=lambda m, a: model.transition(m, a)[1],
+        matrix=emission.matrix,
+        noise=emission.cov(),
+        action_matrix=emission.action_matrix,
+        bias=emission.offset,
+    )
+
+
+KINDS = {
+    "free Q": lambda state: GaussianTransition(state, ACTION, dtype=F64),
+    "free full Q": lambda state: GaussianTransition(state, ACTION, cov="full", dtype=F64),
+    "network Q": lambda state: GaussianTransition(
+        state, ACTION, hidden_sizes=(8,), cov_network=True, dtype=F64
+    ),
+    "network full Q": lambda state: GaussianTransition(
+        state, ACTION, hidden_sizes=(8,), cov="full", cov_network=True, dtype=F64
+    ),
+    "own module": SineTransition,
+}
+
+
+def make_kind(kind: str, state: int, noise: str = "diag") -> BeliefFilter:
+    """A filter with every parameter away from its start."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = BeliefFilter(
+            OBS,
+            ACTION,
+            state,
+            transition=KINDS[kind](state),
+            emission=LinearGaussianEmission(OBS, state, ACTION, cov=noise, dtype=F64),
+            initial_cov="full",
+            dtype=F64,
+        )
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter += 0.1 * torch.randn_like(parameter)
+    return model
+
+
+# ------------------------------------------------------------------------------------ the textbook
+@pytest.mark.parametrize("noise", ["diag", "full"])
+@pytest.mark.parametrize("state", [3, 5, 7])
+@pytest.mark.parametrize("kind", KINDS)
+def test_values_and_gradients_equal_a_hand_loop(kind, state, noise):
+    model, inputs = make_kind(kind, state, noise), make_inputs(state)
+    expected, out = by_hand(model, inputs), model(*inputs, return_cov=True)
+    for received, wanted in (
+        (out.mean, expected.mean),
+        (out.cov, expected.cov),
+        (out.log_likelihood, expected.log_likelihood),
+    ):
+        torch.testing.assert_close(received, wanted, rtol=1e-9, atol=1e-10)
+
+    def gradient(mean: Tensor, ll: Tensor) -> list[Tensor | None]:
+        total = (mean * torch.linspace(-1, 1, mean.shape[-1], dtype=F64)).sum() + ll.sum()
+        return torch.autograd.grad(total, list(model.parameters()), allow_unused=True)
+
+    for (name, _), received, wanted in zip(
+        model.named_parameters(),
+        gradient(out.mean, out.log_likelihood),
+        gradient(expected.mean, expected.log_likelihood),
+        strict=True,
+    ):
+        assert wanted is not None, name
+        torch.testing.assert_close(received, wanted, rtol=1e-8, atol=1e-9, msg=name)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_predict_and_update_by_hand_give_the_same_step(kind):
+    model, inputs = make_kind(kind, 3), make_inputs(3)
+    emission = model.emission
+    mean = inputs.mean
+    for t in range(inputs.reset.shape[-1]):
+        action, observed = inputs.previous_action[:, t], inputs.observed[:, t]
+        observation, reset = inputs.observation[:, t], inputs.reset[:, t]
+        received = model.step(mean, None, action, observation, observed, reset, return_cov=True)
+        moved, cov = model.transition(mean, action)
+        predicted = functional.predict(
+            functional.Belief(mean, cov), lambda m, a: model.transition(m, a)[0], cov, action
+        )
+        moved = torch.where(reset[:, None], model.initial_mean, predicted.mean)
+        cov = torch.where(reset[:, None, None], model.initial_cov, predicted.cov)
+        offset = action @ emission.action_matrix.mT + emission.offset
+        args = (observation, observed, emission.matrix, emission.cov(), offset)
+        filtered = functional.update(functional.Belief(moved, cov), *args)
+        ll = functional.log_likelihood(functional.Belief(moved, cov), *args)
+        torch.testing.assert_close(received.mean, filtered.mean, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(received.cov, filtered.cov, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(received.log_likelihood, ll, rtol=1e-10, atol=1e-10)
+        mean = received.mean
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("batch", [(2,), (2, 3)])
+def test_steps_equal_the_sequence_for_any_batch_shape(kind, batch):
+    model, inputs = make_kind(kind, 3), make_inputs(3, batch)
+    sequence = model(*inputs, return_cov=True)
+    mean = inputs.mean
+    for t in range(inputs.reset.shape[-1]):
+        out = model.step(
+            mean,
+            None,
+            inputs.previous_action[..., t, :],
+            inputs.observation[..., t, :],
+            inputs.observed[..., t, :],
+            inputs.reset[..., t],
+            return_cov=True,
+        )
+        mean = out.mean
+        torch.testing.assert_close(out.mean, sequence.mean[..., t, :], rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(out.cov, sequence.cov[..., t, :, :], rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(
+            out.log_likelihood, sequence.log_likelihood[..., t], rtol=1e-10, atol=1e-10
+        )
+
+
+@pytest.mark.parametrize("form", ["innovation", "information", "loop"])
+@pytest.mark.parametrize("state", [3, 5, 7])
+def test_the_form_changes_nothing(form, state):
+    inputs = make_inputs(state)
+    expected = make_filter(OBS, ACTION, F64, state=state)(*inputs)
+    received = make_filter(OBS, ACTION, F64, state=state, form=form)(*inputs)
+    torch.testing.assert_close(received.mean, expected.mean, rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close(
+        received.log_likelihood, expected.log_likelihood, rtol=1e-9, atol=1e-10
+    )
+
+
+def test_nothing_observed_leaves_the_predicted_belief_and_a_likelihood_of_0():
+    model = make_kind("free full Q", 3)
+    inputs = make_inputs(3)
+    nothing = inputs._replace(observed=torch.zeros_like(inputs.observed))
+    out = model.step(inputs.mean, None, *(value[:, 0] for value in nothing[2:]), return_cov=True)
+    predicted = model.predict(inputs.mean, inputs.previous_action[:, 0], inputs.reset[:, 0])
+    assert torch.equal(out.mean, predicted.mean)
+    assert torch.equal(out.cov, predicted.cov)
+    assert not out.log_likelihood.any()
+
+
+def test_covariances_come_only_where_asked_for():
+    model, inputs = make_kind("network Q", 3), make_inputs(3)
+    assert model(*inputs).cov is None
+    assert model.step(inputs.mean, None, *(value[:, 0] for value in inputs[2:])).cov is None
+
+
+@pytest.mark.parametrize("kind", ["network full Q", "own module"])
+@pytest.mark.parametrize("over_time", [False, True])
+def test_any_transition_works_through_the_module(kind, over_time):
+    model, inputs = make_kind(kind, 3), make_inputs(3)
+    module = BeliefFilterModule(model)
+    data = TensorDict(
+        {
+            "observation": inputs.observation,
+            "observed": inputs.observed,
+            "previous_action": inputs.previous_action,
+            "is_init": inputs.reset.unsqueeze(-1),
+        },
+        inputs.reset.shape,
+    )
+    first = torch.ones(3, 1, dtype=torch.bool)
+    starts = inputs._replace(reset=torch.cat([first, inputs.reset[:, 1:]], 1))
+    expected = by_hand(model, starts)
+    if over_time:
+        with set_recurrent_mode(True):
+            out = module(data)
+        torch.testing.assert_close(out["features"], expected.mean, rtol=1e-9, atol=1e-10)
+        return
+    mean, age = torch.zeros_like(inputs.mean), torch.zeros(3, 1, dtype=torch.int64)
+    for t in range(inputs.reset.shape[-1]):
+        step = data[:, t].clone()
+        step["is_init"] = starts.reset[:, t, None]
+        step["recurrent"] = TensorDict({"mean": mean, "age": age * ~step["is_init"]}, [3])
+        module(step)
+        mean, age = step["next", "recurrent", "mean"], step["next", "recurrent", "age"]
+        torch.testing.assert_close(step["features"], expected.mean[:, t], rtol=1e-9, atol=1e-10)
+
+
+# -------------------------------------------------------------------------------------- construction
+@pytest.mark.parametrize(("obs", "state"), [(4, 4), (17, 17), (105, 32)])
+def test_the_state_has_as_many_components_as_the_observation_up_to_32(obs, state):
+    model = BeliefFilter(obs, ACTION)
+    assert model.state_dim == state
+    assert model.transition.residual
+
+
+def test_the_default_transition_is_residual_only_where_the_sensors_see_the_whole_state():
+    assert BeliefFilter(OBS, ACTION, OBS).transition.residual
+    assert not BeliefFilter(OBS, ACTION, OBS + 1).transition.residual
+
+
+def test_the_state_follows_the_parts_that_are_given():
+    transition = GaussianTransition(7, ACTION)
+    assert BeliefFilter(OBS, ACTION, transition=transition).state_dim == 7
+    emission = LinearGaussianEmission(OBS, 4, ACTION)
+    assert BeliefFilter(OBS, ACTION, emission=emission).state_dim == 4
+
+
+@pytest.mark.parametrize("kind", ["diag", "full"])
+def test_the_initial_belief_starts_at_zero_with_its_std(kind):
+    model = BeliefFilter(OBS, ACTION, 3, initial_std=0.7, initial_cov=kind, dtype=F64)
+    assert not model.initial_mean.any()
+    expected = 0.49 * torch.eye(3, dtype=F64)
+    torch.testing.assert_close(model.initial_cov, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_it_survives_a_file_a_copy_and_a_cast():
+    model, inputs = make_kind("network Q", 3), make_inputs(3)
+    expected = model(*inputs).mean
+    other = BeliefFilter(
+        OBS, ACTION, 3, transition=KINDS["network Q"](3), initial_cov="full", dtype=F64
+    )
+    other.load_state_dict(saved(model.state_dict()))
+    assert torch.equal(other(*inputs).mean, expected)
+    assert torch.equal(copy.deepcopy(model)(*inputs).mean, expected)
+    cast = copy.deepcopy(model).to(torch.float32)
+    floats = Inputs(*(v.float() if v is not None and v.dtype == F64 else v for v in inputs))
+    torch.testing.assert_close(cast(*floats).mean, expected.float(), rtol=1e-3, atol=1e-4)
+
+
+# ---------------------------------------------------------------------------------------- bad input
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"state_dim": 0}, "`state_dim` must be an int of at least 1, got 0"),
+        ({"obs_dim": 0}, "must be an int of at least 1, got 0"),
+        ({"action_dim": 0}, "`action_dim` must be an int of at least 1, got 0"),
+        ({"initial_cov": "scalar"}, "must be one of diag, full, got 'scalar'"),
+        ({"initial_std": 0.0}, "0 < min_std < init_std"),
+        (
+            {"transition": GaussianTransition(4, ACTION)},
+            "`transition` has state_dim=4, the filter state_dim=3",
+        ),
+        (
+            {"transition": GaussianTransition(3, 9)},
+            "`transition` has action_dim=9, the filter action_dim=2",
+        ),
+        (
+            {"emission": LinearGaussianEmission(9, 3, ACTION)},
+            "`emission` has obs_dim=9, the filter obs_dim=5",
+        ),
+    ],
+)
+def test_a_filter_that_cannot_be_is_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        BeliefFilter(**{"obs_dim": OBS, "action_dim": ACTION, "state_dim": 3, **kwargs})
+
+
+def test_an_unknown_form_is_refused():
+    with pytest.raises(ValueError, match="`form`.*'fast'"):
+        BeliefFilter(OBS, ACTION, 3, form="fast", dtype=F64)(*make_inputs(3))
+
+
+BAD = {
+    "mask of floats": (
+        {"observed": torch.ones(3, 6, OBS)},
+        r"`observed` must be bool of shape \(\*batch, obs\) = \(3, 6, 5\), got float32 \(3, 6, 5\)",
+    ),
+    "mask of one entry": (
+        {"observed": torch.ones(3, 6, 1, dtype=torch.bool)},
+        r"`observed` must be bool of shape .*got bool \(3, 6, 1\)",
+    ),
+    "observation of another size": (
+        {"observation": torch.ones(3, 6, 4, dtype=F64)},
+        r"`observation` must have shape \(\*batch, obs\) = \(3, 6, 5\).*another environment",
+    ),
+    "action of another size": (
+        {"previous_action": torch.ones(3, 6, 1, dtype=F64)},
+        r"`previous_action` must have shape \(\*batch, action\) = \(3, 6, 2\)",
+    ),
+    "float64 in float32": (
+        {"observation": torch.ones(3, 6, OBS, dtype=torch.float32)},
+        "`observation` is torch.float32, the filter's parameters are torch.float64.*DoubleToFloat",
+    ),
+    "reset of ints": (
+        {"reset": torch.zeros(3, 6, dtype=torch.int64)},
+        r"`reset` must be bool of shape \(\*batch,\), got int64 \(3, 6\)",
+    ),
+    "mean of another size": (
+        {"mean": torch.zeros(3, 9, dtype=F64)},
+        r"`mean` must .*shape \(\*batch, state\) = \(3, 3\), got .*\(3, 9\)",
+    ),
+}
+
+
+@pytest.mark.parametrize(("method", "case"), list(itertools.product(["forward", "step"], BAD)))
+def test_bad_input_is_one_clear_line(method, case):
+    changed, message = BAD[case]
+    inputs = make_inputs(3)._replace(**changed)
+    if method == "step":
+        inputs = Inputs(inputs.mean, None, *(value[:, 0] for value in inputs[2:]))
+        message = message.replace(r"3, 6, ", "3, ").replace(r"(3, 6\)", r"(3,\)")
+    model = make_kind("free Q", 3)
+    with pytest.raises(ValueError, match=message):
+        getattr(model, method)(*inputs)
+
+
+def test_a_float64_observation_in_a_float32_filter_is_refused():
+    inputs = make_inputs(3)
+    with pytest.raises(ValueError, match="`observation` is torch.float64.*DoubleToFloat"):
+        make_filter(OBS, ACTION, torch.float32, state=3)(*inputs)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_value_that_is_none_under_a_true_mask_is_refused_and_the_check_can_be_off(value):
+    inputs = make_inputs(3)
+    inputs.observation[1, 2, 4] = value  # frame 2 has arrived whole
+    for kind in ("free Q", "network Q"):
+        with pytest.raises(ValueError, match=r"components \[4\]\).*ObservedFromNaN"):
+            make_kind(kind, 3)(*inputs)
+    unchecked = make_filter(OBS, ACTION, F64, state=3, validate=False)(*inputs)
+    assert not unchecked.log_likelihood[1, 2].isfinite()
+    assert unchecked.log_likelihood[0].isfinite().all()
+
+
+def test_a_model_that_diverged_says_so():
+    model = make_kind("free Q", 3)
+    with torch.no_grad():
+        model.transition.layers[-1].bias.fill_(torch.nan)
+    with pytest.raises(ValueError, match="the learned model diverged"):
+        model(*make_inputs(3))

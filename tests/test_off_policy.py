@@ -1,0 +1,145 @@
+"""The transforms know nothing of the filter: TorchRL's SAC learns from corrupted sensors.
+
+A short real run on InvertedPendulum-v5: collector, replay buffer, SACLoss, SoftUpdate. What the
+buffer holds is what the sensors gave: a missing entry is 0 after normalisation, or the last value
+that arrived where it is filled, at the root of a transition as in its next step.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, Transform, TransformedEnv
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_drbpn import (
+    FillLastObserved,
+    GymnasiumBatchEnv,
+    MaskedObservationNorm,
+    ObservationMissingness,
+    ObservationNoise,
+    seed_env,
+)
+
+ENVS, OBS, ACTION, FRAMES, BATCHES = 4, 4, 1, 64, 4
+NOISE = 0.01
+
+
+def make_env(last: list[Transform]) -> EnvBase:
+    env = TransformedEnv(
+        GymnasiumBatchEnv("InvertedPendulum-v5", ENVS),
+        Compose(
+            DoubleToFloat(),
+            ObservationNoise(NOISE, complete_key="complete_observation"),
+            ObservationMissingness("mcar", 0.3),
+            *last,
+        ),
+    )
+    seed_env(env, 0)
+    return env
+
+
+def make_networks() -> tuple[ProbabilisticActor, ValueOperator]:
+    # the policy reads which entries arrived as well
+    class Head(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = nn.Sequential(
+                nn.Linear(2 * OBS, 32), nn.ReLU(), nn.Linear(32, 2 * ACTION), NormalParamExtractor()
+            )
+
+        def forward(self, observation, observed):
+            return self.net(torch.cat([observation, observed.to(observation.dtype)], -1))
+
+    class Value(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = nn.Sequential(nn.Linear(2 * OBS + ACTION, 32), nn.ReLU(), nn.Linear(32, 1))
+
+        def forward(self, observation, observed, action):
+            return self.net(torch.cat([observation, observed.to(observation.dtype), action], -1))
+
+    actor = ProbabilisticActor(
+        TensorDictModule(Head(), ["observation", "observed"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -3.0, "high": 3.0},
+        return_log_prob=False,
+    )
+    return actor, ValueOperator(Value(), in_keys=["observation", "observed", "action"])
+
+
+@pytest.mark.parametrize("treatment", ["normalised", "filled"])
+def test_sac_learns_from_what_the_sensors_gave(treatment):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        last = {"normalised": MaskedObservationNorm, "filled": FillLastObserved}[treatment]()
+        actor, qvalue = make_networks()
+        loss = SACLoss(actor, qvalue, num_qvalue_nets=2, target_entropy=-float(ACTION))
+        loss.make_value_estimator(gamma=0.99)
+        target = SoftUpdate(loss, eps=0.99)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), batch_size=32)
+        before = [parameter.detach().clone() for parameter in actor.parameters()]
+        collector = Collector(
+            make_env([last]),
+            actor,
+            frames_per_batch=FRAMES,
+            total_frames=BATCHES * FRAMES,
+            auto_register_policy_transforms=False,
+        )
+        rollouts, losses = [], []
+        try:
+            for data in collector:
+                rollouts.append(data.clone())
+                buffer.extend(data.reshape(-1))
+                for _ in range(4):
+                    sample = buffer.sample()
+                    check_masks(sample, treatment)
+                    out = loss(sample)
+                    total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
+                    optimizer.zero_grad()
+                    total.backward()
+                    optimizer.step()
+                    target.step()
+                    losses.append(total.detach())
+        finally:
+            collector.shutdown()
+
+    assert torch.stack(losses).isfinite().all()
+    assert any((p != old).any() for p, old in zip(actor.parameters(), before, strict=True))
+    data = torch.cat(rollouts, 1)
+    assert data.shape == (ENVS, BATCHES * FRAMES // ENVS)
+    assert data["next", "done"].any()
+    missing = 1 - data["observed"].float().mean((0, 1))
+    assert (missing - 0.3).abs().max() < 0.1
+    if treatment == "filled":
+        check_filled(data)
+
+
+def check_masks(sample, treatment: str) -> None:
+    for part in (sample, sample["next"]):
+        assert part["observed"].dtype == torch.bool
+        assert part["observed"].shape == part["observation"].shape
+        assert part["observation"].isfinite().all()
+        if treatment == "normalised":
+            # zero where nothing arrived, and nowhere else: noise keeps arrived entries off zero
+            assert torch.equal(part["observation"] == 0, ~part["observed"])
+        else:
+            arrived = part["observed"]
+            error = part["observation"][arrived] - part["complete_observation"][arrived]
+            assert error.abs().max() < 6 * NOISE
+            assert (error != 0).all()
+
+
+def check_filled(data) -> None:
+    """Along each row a missing entry repeats the one before, or is 0 at an episode's start."""
+    for t in range(data.shape[1]):
+        before, after = data[:, t], data[:, t]["next"]
+        expected = torch.where(after["observed"], after["observation"], before["observation"])
+        assert torch.equal(after["observation"], expected)

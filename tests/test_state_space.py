@@ -1,0 +1,237 @@
+"""What the learned state-space model is held to: eq. (2), (3), (8) [DRBPN] and their noise.
+
+Every covariance is symmetric positive definite with a floor under its standard deviations, starts
+exactly where it was told to, and may be diagonal or full, a free parameter or a network. The
+emission starts as [I 0]. Wrong sizes and choices are refused by name.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import oracles
+import pytest
+import torch
+
+from torchrl_drbpn import GaussianTransition, LinearGaussianEmission
+
+STATE, ACTION, OBS = 3, 2, 5
+F64 = torch.float64
+COVS = list(itertools.product(("diag", "full"), (False, True)))
+
+
+def inputs(batch: tuple[int, ...] = (7,), seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return (
+        torch.randn(*batch, STATE, generator=g, dtype=F64),
+        torch.randn(*batch, ACTION, generator=g, dtype=F64),
+    )
+
+
+def scramble(module: torch.nn.Module, scale: float, seed: int = 0) -> None:
+    g = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_(scale * torch.randn(parameter.shape, generator=g, dtype=F64))
+
+
+# ------------------------------------------------------------------------------------------ transition
+@pytest.mark.parametrize(("cov", "cov_network"), COVS)
+@pytest.mark.parametrize("std", [0.3, 1e-2, 5.0])
+def test_q_starts_exactly_at_init_std(cov, cov_network, std):
+    transition = GaussianTransition(
+        STATE, ACTION, cov=cov, cov_network=cov_network, init_std=std, dtype=F64
+    )
+    expected = std**2 * torch.eye(STATE, dtype=F64)
+    received = transition(*inputs()).cov
+    assert received.shape == (7, STATE, STATE)
+    torch.testing.assert_close(received, expected.expand(7, -1, -1), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(("cov", "cov_network"), COVS)
+@pytest.mark.parametrize("scale", [0.5, 5.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_q_is_symmetric_positive_definite_with_its_floor_whatever_the_parameters(
+    cov, cov_network, scale, seed
+):
+    floor = 0.05
+    transition = GaussianTransition(
+        STATE, ACTION, hidden_sizes=(8,), cov=cov, cov_network=cov_network, min_std=floor, dtype=F64
+    )
+    scramble(transition, scale, seed)
+    q = transition(*inputs(seed=seed)).cov
+    assert torch.equal(q, q.mT)
+    largest = torch.linalg.eigvalsh(q)[..., -1:]
+    assert (torch.linalg.eigvalsh(q) >= floor**2 - 1e-12 * largest).all()
+    if cov == "diag":
+        assert torch.equal(q, torch.diag_embed(q.diagonal(dim1=-2, dim2=-1)))
+
+
+@pytest.mark.parametrize(("cov", "cov_network"), COVS)
+def test_the_floor_holds_where_the_likelihood_pulls_the_noise_to_zero(cov, cov_network):
+    transition = GaussianTransition(
+        STATE, ACTION, cov=cov, cov_network=cov_network, min_std=0.1, dtype=F64
+    )
+    target = transition.noise.raw if not cov_network else transition.cov_layers[-1].bias
+    with torch.no_grad():
+        target.fill_(-1e3)
+    eigenvalues = torch.linalg.eigvalsh(transition(*inputs()).cov)
+    assert (eigenvalues >= 0.01 - 1e-9).all()
+    assert eigenvalues.isfinite().all()
+
+
+@pytest.mark.parametrize("cov_network", [False, True])
+def test_a_network_q_depends_on_mean_and_action_and_a_free_one_does_not(cov_network):
+    transition = GaussianTransition(STATE, ACTION, cov="full", cov_network=cov_network, dtype=F64)
+    scramble(transition, 0.5)
+    mean, action = inputs()
+    q = transition(mean, action).cov
+    for changed in ((mean + 1, action), (mean, action + 1)):
+        assert torch.equal(transition(*changed).cov, q) is not cov_network
+    assert transition.constant_cov is not cov_network
+
+
+@pytest.mark.parametrize("residual", [False, True])
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize("hidden", [(), (8,), (8, 6)])
+def test_the_mean_is_the_network_of_mean_and_action(residual, activation, hidden):
+    transition = GaussianTransition(
+        STATE, ACTION, hidden_sizes=hidden, activation=activation, residual=residual, dtype=F64
+    )
+    mean, action = inputs((2, 3))
+    weights = [layer.weight for layer in transition.layers]
+    biases = [layer.bias for layer in transition.layers]
+    expected = oracles.mean_network(weights, biases, residual, activation)(mean, action)
+    torch.testing.assert_close(transition(mean, action).mean, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_network_q_asked_for_without_its_inputs_says_so():
+    transition = GaussianTransition(STATE, ACTION, cov_network=True)
+    with pytest.raises(ValueError, match="`mean` and `action` are needed"):
+        transition.cov()
+
+
+# -------------------------------------------------------------------------------------------- emission
+@pytest.mark.parametrize("state", [3, 5, 8])
+def test_the_emission_starts_as_the_first_rows_or_columns_of_the_identity(state):
+    emission = LinearGaussianEmission(OBS, state, ACTION, dtype=F64)
+    s = torch.randn(4, state, dtype=F64)
+    n = min(OBS, state)
+    out = emission(s, torch.randn(4, ACTION, dtype=F64))
+    assert torch.equal(out[:, :n], s[:, :n])
+    assert not out[:, n:].any()
+
+
+def test_the_expected_observation_is_h_s_plus_b_a_plus_d():
+    emission = LinearGaussianEmission(OBS, STATE, ACTION, dtype=F64)
+    scramble(emission, 1.0)
+    s, a = inputs((4, 2))
+    received = emission(s, a)
+    for i, j in itertools.product(range(4), range(2)):
+        expected = emission.matrix @ s[i, j] + emission.action_matrix @ a[i, j] + emission.offset
+        torch.testing.assert_close(received[i, j], expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("cov", ["diag", "full"])
+@pytest.mark.parametrize("std", [0.1, 2.0])
+def test_r_starts_exactly_at_init_std_and_keeps_its_floor(cov, std):
+    emission = LinearGaussianEmission(OBS, STATE, ACTION, cov=cov, init_std=std, dtype=F64)
+    expected = std**2 * torch.eye(OBS, dtype=F64)
+    torch.testing.assert_close(emission.cov(), expected, rtol=1e-12, atol=1e-14)
+    for scale in (0.5, 5.0):
+        scramble(emission, scale)
+        r = emission.cov()
+        assert torch.equal(r, r.mT)
+        eigenvalues = torch.linalg.eigvalsh(r)
+        assert (eigenvalues >= emission.noise.min_std**2 - 1e-12 * eigenvalues[-1]).all()
+
+
+def test_a_compact_r_is_the_diagonal_of_a_diagonal_and_the_whole_of_a_full():
+    diagonal = LinearGaussianEmission(OBS, STATE, ACTION, cov="diag")
+    scrambled = diagonal.cov()
+    assert torch.equal(diagonal.compact_cov(), scrambled.diagonal())
+    full = LinearGaussianEmission(OBS, STATE, ACTION, cov="full")
+    assert torch.equal(full.compact_cov(), full.cov())
+
+
+def test_a_fixed_matrix_is_saved_but_not_learned():
+    emission = LinearGaussianEmission(OBS, 7, ACTION, fixed_matrix=True)
+    assert "matrix" in emission.state_dict()
+    assert "matrix" not in dict(emission.named_parameters())
+    assert torch.equal(emission.matrix, torch.eye(OBS, 7))
+
+
+# ------------------------------------------------------------------------------------- parameters, both
+@pytest.mark.parametrize(
+    "module",
+    [
+        GaussianTransition(STATE, ACTION, cov="full", cov_network=True),
+        GaussianTransition(STATE, ACTION),
+        LinearGaussianEmission(OBS, STATE, ACTION, cov="full"),
+    ],
+    ids=["network Q", "free Q", "emission"],
+)
+def test_reset_parameters_go_back_to_the_start(module):
+    def noise() -> torch.Tensor:
+        if isinstance(module, LinearGaussianEmission):
+            return module.cov()
+        return module.cov(torch.ones(STATE), torch.ones(ACTION))
+
+    start = noise().detach().clone()
+    before = [parameter.detach().clone() for parameter in module.parameters()]
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter += 1000
+    module.reset_parameters()
+    torch.testing.assert_close(noise(), start)
+    for parameter, old in zip(module.parameters(), before, strict=True):
+        assert (parameter - old).abs().max() < 10
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_every_parameter_has_the_dtype_asked_for(dtype):
+    for module in (
+        GaussianTransition(STATE, ACTION, cov="full", dtype=dtype),
+        GaussianTransition(STATE, ACTION, cov_network=True, dtype=dtype),
+        LinearGaussianEmission(OBS, STATE, ACTION, dtype=dtype),
+    ):
+        assert {parameter.dtype for parameter in module.parameters()} == {dtype}
+
+
+# ------------------------------------------------------------------------------------------- bad input
+@pytest.mark.parametrize("value", [0, -1, 2.0, True])
+@pytest.mark.parametrize("name", ["state_dim", "action_dim", "obs_dim"])
+def test_a_dimension_that_is_no_positive_int_is_refused(name, value):
+    dims = {"state_dim": STATE, "action_dim": ACTION, name: value}
+    message = f"`{name}` must be an int of at least 1, got {value}"
+    if name != "obs_dim":
+        with pytest.raises(ValueError, match=message):
+            GaussianTransition(**dims)
+    with pytest.raises(ValueError, match=message):
+        LinearGaussianEmission(**{"obs_dim": OBS, **dims})
+
+
+@pytest.mark.parametrize("make", [GaussianTransition, LinearGaussianEmission])
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"cov": "scalar"}, "`cov` must be one of diag, full, got 'scalar'"),
+        ({"init_std": 0.01, "min_std": 0.02}, "`min_std` and `init_std` must satisfy"),
+        ({"min_std": 0.0}, "0 < min_std < init_std, got min_std=0"),
+        ({"init_std": float("nan")}, "`min_std` and `init_std` must satisfy"),
+    ],
+)
+def test_a_wrong_noise_is_refused(make, kwargs, message):
+    dims = (STATE, ACTION) if make is GaussianTransition else (OBS, STATE, ACTION)
+    with pytest.raises(ValueError, match=message):
+        make(*dims, **kwargs)
+
+
+def test_an_unknown_activation_is_refused():
+    with pytest.raises(ValueError, match="`activation` must be one of relu, tanh, got 'gelu'"):
+        GaussianTransition(STATE, ACTION, activation="gelu")
+
+
+def test_a_fixed_matrix_that_misses_sensors_is_refused():
+    with pytest.raises(ValueError, match="`fixed_matrix` needs state_dim >= obs_dim"):
+        LinearGaussianEmission(OBS, STATE, ACTION, fixed_matrix=True)
