@@ -446,7 +446,7 @@ class LossContract:
             loss.set_keys(**{name: None})
             assert getattr(loss.tensor_keys, name) == getattr(defaults, name)
         loss = self.make_loss()
-        loss.set_keys(**{name: "renamed" for name in names})
+        loss.set_keys(**dict.fromkeys(names, "renamed"))
         assert all(getattr(loss.tensor_keys, name) == "renamed" for name in names)
 
     def test_in_keys_are_all_that_is_read(self):
@@ -720,7 +720,7 @@ class BeliefModuleContract:
             renamed.rename_key_("is_init", "first")
             received = named(renamed)
         assert torch.equal(received["agent", "embed"], expected)
-        assert "features" not in received.keys()
+        assert "features" not in received
 
     def test_dispatch_takes_tensors_by_name(self):
         module = self.make_module()

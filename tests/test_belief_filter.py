@@ -267,7 +267,7 @@ def test_any_transition_works_through_the_module(kind, over_time):
         torch.testing.assert_close(step["features"], expected.mean[:, t], rtol=1e-9, atol=1e-10)
 
 
-# -------------------------------------------------------------------------------------- construction
+# ------------------------------------------------------------------------------------- construction
 @pytest.mark.parametrize(("obs", "state"), [(4, 4), (17, 17), (105, 32)])
 def test_the_state_has_as_many_components_as_the_observation_up_to_32(obs, state):
     model = BeliefFilter(obs, ACTION)
@@ -316,8 +316,8 @@ def test_it_survives_a_file_a_copy_and_a_cast():
         ({"state_dim": 0}, "`state_dim` must be an int of at least 1, got 0"),
         ({"obs_dim": 0}, "must be an int of at least 1, got 0"),
         ({"action_dim": 0}, "`action_dim` must be an int of at least 1, got 0"),
-        ({"initial_cov": "scalar"}, "must be one of diag, full, got 'scalar'"),
-        ({"initial_std": 0.0}, "0 < min_std < init_std"),
+        ({"initial_cov": "scalar"}, "`initial_cov` must be one of diag, full, got 'scalar'"),
+        ({"initial_std": 0.0}, "`initial_std` must be above its floor"),
         (
             {"transition": GaussianTransition(4, ACTION)},
             "`transition` has state_dim=4, the filter state_dim=3",
@@ -338,7 +338,7 @@ def test_a_filter_that_cannot_be_is_refused(kwargs, message):
 
 
 def test_an_unknown_form_is_refused():
-    with pytest.raises(ValueError, match="`form`.*'fast'"):
+    with pytest.raises(ValueError, match=r"`form`.*'fast'"):
         BeliefFilter(OBS, ACTION, 3, form="fast", dtype=F64)(*make_inputs(3))
 
 
@@ -388,7 +388,7 @@ def test_bad_input_is_one_clear_line(method, case):
 
 def test_a_float64_observation_in_a_float32_filter_is_refused():
     inputs = make_inputs(3)
-    with pytest.raises(ValueError, match="`observation` is torch.float64.*DoubleToFloat"):
+    with pytest.raises(ValueError, match=r"`observation` is torch.float64.*DoubleToFloat"):
         make_filter(OBS, ACTION, torch.float32, state=3)(*inputs)
 
 

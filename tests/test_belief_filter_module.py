@@ -224,6 +224,32 @@ def test_mean_cov_features_are_the_mean_and_the_lower_triangle():
     assert torch.equal(out["features"], expected)
 
 
+@pytest.mark.parametrize("over_time", [False, True])
+@pytest.mark.parametrize("stored", [False, True])
+@pytest.mark.parametrize(
+    ("state", "cov_network"), [(OBS, False), (3, False), (7, False), (3, True)]
+)
+def test_no_tensor_is_made_on_another_device(state, cov_network, stored, over_time):
+    # the device "meta" refuses to be mixed with "cpu", as a GPU does
+    model = make_filter(dtype=torch.float64, state=state, cov_network=cov_network, validate=False)
+    module = BeliefFilterModule(
+        model,
+        policy_input="mean_cov",
+        out_keys=["features", ("belief", "log_likelihood"), *OPTIONAL],
+    ).to("meta")
+    data = make_frames((3, 4))
+    data = (with_state(data, state) if stored else data).to("meta")
+    with set_recurrent_mode(over_time):
+        if stored or over_time:
+            out = module(data)
+        else:
+            with pytest.warns(UserWarning, match="make_tensordict_primer"):
+                out = module(data)
+    assert all(out[key].device.type == "meta" for key in module.out_keys)
+    (out["features"].sum() + out["belief", "log_likelihood"].sum()).backward()
+    assert all(parameter.grad.device.type == "meta" for parameter in module.parameters())
+
+
 # ------------------------------------------------------------------------------- laws of the filter
 def test_what_a_missing_entry_holds_changes_neither_belief_nor_gradient():
     grads = []
@@ -256,7 +282,7 @@ def test_rows_in_mid_episode_send_no_gradient_to_the_initial_belief():
     assert not module.filter.initial_mean.grad.any()
 
 
-# ------------------------------------------------------------------------------------ vmap, deepcopy
+# ----------------------------------------------------------------------------------- vmap, deepcopy
 @pytest.mark.parametrize("over_time", [False, True])
 def test_vmap_works_over_the_generic_loop_without_value_checks(over_time):
     module = BeliefFilterModule(make_filter(dtype=torch.float64, form="loop", validate=False))

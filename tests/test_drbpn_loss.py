@@ -230,7 +230,7 @@ def test_on_fresh_data_the_ratio_and_the_effective_sample_size_are_one(length):
     assert out["clip_fraction"] == 0
 
 
-# --------------------------------------------------------------------- every observation counts once
+# -------------------------------------------------------------------- every observation counts once
 def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
     """Log-likelihood of every received observation, and entries, from the row-deleting oracle.
 
@@ -488,7 +488,7 @@ def test_a_negative_model_coefficient_is_refused():
 
 
 def test_an_unknown_key_is_refused_with_those_it_accepts():
-    with pytest.raises(ValueError, match="'advantages'.*DRBPNLoss; it accepts .*'advantage'"):
+    with pytest.raises(ValueError, match=r"'advantages'.*DRBPNLoss; it accepts .*'advantage'"):
         make_loss().set_keys(advantages="a")
 
 

@@ -35,7 +35,7 @@ def scramble(module: torch.nn.Module, scale: float, seed: int = 0) -> None:
             parameter.copy_(scale * torch.randn(parameter.shape, generator=g, dtype=F64))
 
 
-# ------------------------------------------------------------------------------------------ transition
+# --------------------------------------------------------------------------------------- transition
 @pytest.mark.parametrize(("cov", "cov_network"), COVS)
 @pytest.mark.parametrize("std", [0.3, 1e-2, 5.0])
 def test_q_starts_exactly_at_init_std(cov, cov_network, std):
@@ -111,7 +111,7 @@ def test_a_network_q_asked_for_without_its_inputs_says_so():
         transition.cov()
 
 
-# -------------------------------------------------------------------------------------------- emission
+# ----------------------------------------------------------------------------------------- emission
 @pytest.mark.parametrize("state", [3, 5, 8])
 def test_the_emission_starts_as_the_first_rows_or_columns_of_the_identity(state):
     emission = LinearGaussianEmission(OBS, state, ACTION, dtype=F64)
@@ -161,7 +161,7 @@ def test_a_fixed_matrix_is_saved_but_not_learned():
     assert torch.equal(emission.matrix, torch.eye(OBS, 7))
 
 
-# ------------------------------------------------------------------------------------- parameters, both
+# --------------------------------------------------------------------------------- parameters, both
 @pytest.mark.parametrize(
     "module",
     [
@@ -198,7 +198,7 @@ def test_every_parameter_has_the_dtype_asked_for(dtype):
         assert {parameter.dtype for parameter in module.parameters()} == {dtype}
 
 
-# ------------------------------------------------------------------------------------------- bad input
+# ---------------------------------------------------------------------------------------- bad input
 @pytest.mark.parametrize("value", [0, -1, 2.0, True])
 @pytest.mark.parametrize("name", ["state_dim", "action_dim", "obs_dim"])
 def test_a_dimension_that_is_no_positive_int_is_refused(name, value):

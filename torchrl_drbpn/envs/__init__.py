@@ -1,5 +1,6 @@
 """Many simulators as one TorchRL environment."""
 
+from torchrl_drbpn.envs.envpool_batch import EnvPoolBatchEnv
 from torchrl_drbpn.envs.gymnasium_batch import GymnasiumBatchEnv
 
-__all__ = ["GymnasiumBatchEnv"]
+__all__ = ["EnvPoolBatchEnv", "GymnasiumBatchEnv"]

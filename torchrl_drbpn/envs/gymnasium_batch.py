@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
+from torchrl_drbpn.envs.batched import NO_SEED, BatchedSimulators
 from torchrl_drbpn.envs.making import find_limit, make_simulators
 from torchrl_drbpn.envs.simulator_state import (
     is_mujoco,
@@ -27,10 +25,8 @@ from torchrl_drbpn.envs.simulator_state import (
 
 __all__ = ["GymnasiumBatchEnv"]
 
-_NO_SEED = -1
 
-
-class GymnasiumBatchEnv(EnvBase):
+class GymnasiumBatchEnv(BatchedSimulators):
     r"""Step many Gymnasium environments as one TorchRL environment with batch size ``[num_envs]``.
 
     The trajectories are those of ``gymnasium.make(env_id)``, bit for bit in ``float64``: the same
@@ -80,9 +76,6 @@ class GymnasiumBatchEnv(EnvBase):
         True
     """
 
-    # `frame_skip` in `make_kwargs` belongs to the simulator: TorchRL must not add its own.
-    _has_frame_skip = True
-
     def __init__(
         self,
         env_id: str,
@@ -95,32 +88,21 @@ class GymnasiumBatchEnv(EnvBase):
         num_threads: int = 1,
         **make_kwargs: Any,
     ) -> None:
-        _check_count("num_envs", num_envs)
-        _check_count("num_threads", num_threads)
-        if max_episode_steps is not None and max_episode_steps != -1:
-            _check_count("max_episode_steps", max_episode_steps)
-        if dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"`dtype` must be torch.float32 or torch.float64, got {dtype}.")
-        super().__init__(device=device, batch_size=torch.Size([num_envs]))
-        self.env_id = env_id
-        self.num_envs = num_envs
-        self.dtype = dtype
-        self.num_threads = min(num_threads, num_envs)
         self.make_kwargs = make_kwargs
-        registered = find_limit(env_id)
-        self.max_episode_steps = registered if max_episode_steps is None else max_episode_steps
-        if self.max_episode_steps == -1:
-            self.max_episode_steps = None
-        self._build()
-        self._elapsed = np.zeros(num_envs, dtype=np.int64)
-        self._seeds = np.full(num_envs, _NO_SEED, dtype=np.int64)
-        self._started = np.zeros(num_envs, dtype=bool)
-        self._all_started = False
-        self._make_specs()
-        if seed is not None:
-            self.set_seed(seed)
+        super().__init__(
+            env_id,
+            num_envs,
+            seed=seed,
+            device=device,
+            dtype=dtype,
+            max_episode_steps=max_episode_steps,
+            num_threads=num_threads,
+        )
 
     # Construction ---------------------------------------------------------------------------
+
+    def _find_limit(self) -> int | None:
+        return find_limit(self.env_id)
 
     def _build(self) -> None:
         """Make the Gymnasium environments and look up what the hot loop needs."""
@@ -133,75 +115,17 @@ class GymnasiumBatchEnv(EnvBase):
         action: Any = self.envs[0].action_space
         self._action_low, self._action_high = action.low, action.high
         observation: Any = self.envs[0].observation_space
-        self._obs_dim: int = observation.shape[0]
-        self._observation = np.zeros((self.num_envs, self._obs_dim))
-        self.is_closed = False
-
-    def _make_specs(self) -> None:
-        n = self.num_envs
-        low, high = (torch.as_tensor(x) for x in (self._action_low, self._action_high))
-        self.observation_spec = Composite(
-            observation=Unbounded((n, self._obs_dim), dtype=self.dtype, device=self.device),
-            shape=(n,),
-            device=self.device,
-        )
-        self.action_spec = Bounded(
-            low=low.repeat(n, 1), high=high.repeat(n, 1), dtype=low.dtype, device=self.device
-        )
-        self.reward_spec = Unbounded((n, 1), dtype=self.dtype, device=self.device)
-        flag = Binary(1, shape=(n, 1), dtype=torch.bool, device=self.device)
-        self.done_spec = Composite(
-            done=flag,
-            terminated=flag.clone(),
-            truncated=flag.clone(),
-            shape=(n,),
-            device=self.device,
-        )
+        self._obs_dim = observation.shape[0]
 
     # Stepping -------------------------------------------------------------------------------
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        if not self._all_started:
-            row = int(np.flatnonzero(~self._started)[0])
-            raise RuntimeError(
-                f"`{type(self).__name__}` row {row} was stepped before its first reset: "
-                "call reset() first."
-            )
-        action = tensordict.get("action").detach().cpu().numpy()
-        if action.shape != (self.num_envs, *self._action_low.shape):
-            raise ValueError(
-                f"`action` must have shape {(self.num_envs, *self._action_low.shape)} for "
-                f"{self.num_envs} x {self.env_id}, got {action.shape}."
-            )
-        action = np.clip(action, self._action_low, self._action_high, dtype=self._action_low.dtype)
-        # Fresh arrays: collectors keep references to what a step returns.
-        n = self.num_envs
-        observation = np.empty((n, self._obs_dim))
-        reward = np.zeros((n, 1))
-        terminated = np.zeros((n, 1), dtype=bool)
-        truncated = np.zeros((n, 1), dtype=bool)
-        arrays = (action, observation, reward, terminated, truncated)
-        mask = tensordict.get("_step", None)
-        if mask is not None:
-            rows: Any = np.flatnonzero(mask.cpu().numpy().reshape(n))
-            # A row that is not stepped keeps its observation and its flags, with reward 0.
-            observation[:] = self._observation
-            for flag, name in ((terminated, "terminated"), (truncated, "truncated")):
-                if (last := tensordict.get(name, None)) is not None:
-                    flag[:] = last.cpu().numpy()
+    def _advance(self, rows: NDArray[np.int64] | None, *arrays: NDArray[Any]) -> None:
+        if rows is not None:
             self._step_rows(rows.tolist(), *arrays)
-            self._elapsed[rows] += 1
+        elif self.num_threads == 1:
+            self._step_rows(self._shares[0], *arrays)
         else:
-            if self.num_threads == 1:
-                self._step_rows(self._shares[0], *arrays)
-            else:
-                self._step_threads(*arrays)
-            self._elapsed += 1
-            rows = slice(None)
-        if self.max_episode_steps is not None:
-            truncated[rows, 0] |= self._elapsed[rows] >= self.max_episode_steps
-        self._observation = observation
-        return self._pack(observation, terminated, truncated, reward)
+            self._step_threads(*arrays)
 
     def _step_rows(
         self,
@@ -226,48 +150,10 @@ class GymnasiumBatchEnv(EnvBase):
         for other in others:
             other.result()
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
-        del kwargs  # `options` and the like have no batched meaning
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        n = self.num_envs
-        rows = range(n) if mask is None else np.flatnonzero(mask.cpu().numpy().reshape(n)).tolist()
-        observation = self._observation.copy()
-        for i in rows:
+    def _restart(self, rows: NDArray[np.int64], observation: NDArray[np.float64]) -> None:
+        for i in rows.tolist():
             seed = int(self._seeds[i])
-            observation[i], _ = self.envs[i].reset(seed=None if seed == _NO_SEED else seed)
-            self._seeds[i] = _NO_SEED
-            self._elapsed[i] = 0
-            self._started[i] = True
-        self._all_started = bool(self._started.all())
-        self._observation = observation
-        return self._pack(observation, np.zeros((n, 1), dtype=bool), np.zeros((n, 1), dtype=bool))
-
-    def _pack(
-        self,
-        observation: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
-        reward: NDArray[np.float64] | None = None,
-    ) -> TensorDict:
-        device, dtype = self.device, self.dtype
-        # `observation` is kept as the row memory, so that float64 needs a copy of its own.
-        source = {
-            "observation": torch.from_numpy(observation).to(device, dtype, copy=True),
-            "done": torch.from_numpy(terminated | truncated),
-            "terminated": torch.from_numpy(terminated),
-            "truncated": torch.from_numpy(truncated),
-        }
-        if reward is not None:
-            source["reward"] = torch.from_numpy(reward).to(device, dtype)
-        return TensorDict(source, batch_size=self.batch_size, device=device)
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is None:
-            self._seeds[:] = _NO_SEED
-            return
-        if seed < 0:
-            raise ValueError(f"`seed` must be a non-negative integer, got {seed}.")
-        self._seeds[:] = np.random.SeedSequence(seed).generate_state(self.num_envs)
+            observation[i], _ = self.envs[i].reset(seed=None if seed == NO_SEED else seed)
 
     # Saving ---------------------------------------------------------------------------------
 
@@ -291,10 +177,7 @@ class GymnasiumBatchEnv(EnvBase):
             RuntimeError: where :attr:`supports_state` is False.
         """
         if not self.supports_state:
-            raise RuntimeError(
-                f"`{self.env_id}` is not a plain MuJoCo environment and its state can not be "
-                "saved: look at `supports_state` and start new episodes instead."
-            )
+            return super().get_extra_state()
         return {
             "simulators": simulator_state(self.envs),
             "elapsed": torch.from_numpy(self._elapsed.copy()),
@@ -315,9 +198,7 @@ class GymnasiumBatchEnv(EnvBase):
             RuntimeError: where :attr:`supports_state` is False.
         """
         if not self.supports_state:
-            raise RuntimeError(
-                f"`{self.env_id}` is not a plain MuJoCo environment and has no state to restore."
-            )
+            super().set_extra_state(state)  # raises
         shapes = {
             "elapsed": (self.num_envs,),
             "seeds": (self.num_envs,),
@@ -340,6 +221,9 @@ class GymnasiumBatchEnv(EnvBase):
         self._all_started = bool(self._started.all())
         self._observation = state["observation"].cpu().numpy().astype(np.float64)
 
+    def _why_no_state(self) -> str:
+        return "it is not a plain MuJoCo environment"
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what a pickle or a deep copy needs: Gymnasium's own pickles lose the state."""
         state = self.__dict__.copy()
@@ -353,40 +237,15 @@ class GymnasiumBatchEnv(EnvBase):
         saved = state.pop("_saved")
         super().__setstate__(state)
         self._build()
+        self.is_closed = False
         if saved is not None:
             self.set_extra_state(saved)
         else:
-            self._started[:] = False
-            self._all_started = False
+            self._forget_episodes()
 
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the simulators, their renderers and the threads.
-
-        Args:
-            raise_if_closed: raise where the environment was closed before.
-
-        Raises:
-            RuntimeError: where it was closed before, unless ``raise_if_closed`` is False.
-        """
-        if self.is_closed:
-            if raise_if_closed:
-                raise RuntimeError("trying to close a closed environment")
-            return
-        self.is_closed = True
+    def _close_simulators(self) -> None:
         for env in self.envs:
             env.close()
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
-
-    def __repr__(self) -> str:
-        """Name the task, the number of environments and the device."""
-        return (
-            f"{type(self).__name__}({self.env_id!r}, num_envs={self.num_envs}, "
-            f"device={self.device}, dtype={self.dtype})"
-        )
-
-
-def _check_count(name: str, value: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"`{name}` must be an integer of at least 1, got {value!r}.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
-__all__ = ["find_limit", "make_simulators"]
+__all__ = ["check_spaces", "find_limit", "make_simulators", "near_ids"]
 
 _log = logging.getLogger(__name__)
 
@@ -36,12 +36,29 @@ def find_limit(env_id: str) -> int | None:
     try:
         limit: int | None = gymnasium.spec(env_id).max_episode_steps
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
-        near = difflib.get_close_matches(env_id, gymnasium.registry, n=4, cutoff=0.5)
-        hint = f"did you mean {', '.join(near)}?" if near else "is its package imported?"
+        hint = near_ids(env_id, gymnasium.registry) or "is its package imported?"
         raise ValueError(
             f"`env_id` must be a registered Gymnasium environment, got {env_id!r}: {hint}"
         ) from error
     return limit
+
+
+def near_ids(env_id: str, known: Iterable[str]) -> str:
+    """Return a question that names the ids spelt like an unknown one.
+
+    Args:
+        env_id: the unknown id.
+        known: the ids that exist.
+
+    Returns:
+        The question; "" where no id is near.
+
+    Examples:
+        >>> near_ids("Walker2D-v5", ["Walker2d-v5", "Ant-v5"])
+        'did you mean Walker2d-v5?'
+    """
+    near = difflib.get_close_matches(env_id, known, n=4, cutoff=0.5)
+    return f"did you mean {', '.join(near)}?" if near else ""
 
 
 def make_simulators(
@@ -76,12 +93,21 @@ def make_simulators(
                 env = env.env
             envs.append(env)
             if len(envs) == 1:
-                _check_spaces(env_id, env)
+                check_spaces(env_id, env.observation_space, env.action_space)
     return envs
 
 
-def _check_spaces(env_id: str, env: gymnasium.Env[Any, Any]) -> None:
-    observation, action = env.observation_space, env.action_space
+def check_spaces(env_id: str, observation: object, action: object) -> None:
+    """Refuse a task whose observation or action is not a vector of real numbers.
+
+    Args:
+        env_id: the task, for the message.
+        observation: its observation space.
+        action: its action space.
+
+    Raises:
+        ValueError: where one of them is not a Box of floats with one dimension.
+    """
     if (
         not isinstance(observation, gymnasium.spaces.Box)
         or len(observation.shape) != 1

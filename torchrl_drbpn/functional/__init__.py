@@ -1,7 +1,6 @@
 """Pure tensor maths of the belief filter and of the corruption; torch alone."""
 
 from torchrl_drbpn.functional.corruption import (
-    MissingnessKind,
     MissingnessMechanism,
     count_always_observed,
     draw_mechanism,
@@ -26,15 +25,13 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
-from torchrl_drbpn.functional.model import Form, StateSpace, choose_form, predict_step
+from torchrl_drbpn.functional.model import StateSpace, choose_form, predict_step
 from torchrl_drbpn.functional.recurrence import MeanNetwork
 
 __all__ = [
     "Belief",
     "FilterOutput",
-    "Form",
     "MeanNetwork",
-    "MissingnessKind",
     "MissingnessMechanism",
     "StateSpace",
     "choose_form",

@@ -246,20 +246,23 @@ def _run_back(
     )
 
 
-def _spd_factor(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the inverse, the log-determinant and the factor of a batch of SPD matrices.
+def _spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the inverse and the log-determinant of a batch of SPD matrices.
 
     One item that fails (it cannot while the noise floors hold) turns into NaN by itself instead
     of failing the whole batch, without a synchronisation or a branch.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
-    failed = (info != 0)[..., None, None]
-    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    factor = torch.where(failed, eye, factor)
+    failed = (info != 0).unsqueeze(-1)
+    # cholesky_inverse refuses a zero on the diagonal; only the diagonal is touched, it is small
+    diagonal = factor.diagonal(dim1=-2, dim2=-1)
+    diagonal.masked_fill_(failed, 1.0)
     inverse = torch.cholesky_inverse(factor).mT  # symmetric; LAPACK's result is column-major
-    inverse = torch.where(failed, torch.nan, inverse)
-    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return inverse, log_det, factor
+    inverse = (
+        inverse + torch.zeros_like(diagonal[..., :1]).masked_fill_(failed, torch.nan)[..., None]
+    )
+    log_det = 2.0 * diagonal.log().sum(-1)
+    return inverse, log_det
 
 
 class InnovationRecurrence(torch.autograd.Function):
@@ -274,17 +277,19 @@ class InnovationRecurrence(torch.autograd.Function):
         time, batch, obs = y.shape
         state = start.shape[-1]
 
-        both = observed.unsqueeze(-1) & observed.unsqueeze(-2)
-        eye = torch.eye(obs, dtype=y.dtype, device=y.device)
-        chosen = torch.where(reset.unsqueeze(-1), initial_cov, cov)
-        inverse, log_det, _ = _spd_factor(torch.where(both, chosen, eye))
-        inverse = torch.where(both, inverse, 0.0)
-        flat = inverse.reshape(time * batch * obs, obs)
+        # Masking by products and lerp with weights of exactly 0 or 1: the same numbers as
+        # torch.where, which costs several times as much on these, the largest tensors here.
+        mask = observed.to(y.dtype)
+        both = mask.unsqueeze(-1) * mask.unsqueeze(-2)
+        at_reset = reset.to(y.dtype).unsqueeze(-1)
+        masked = torch.lerp(cov, initial_cov, at_reset) * both
+        masked.diagonal(dim1=-2, dim2=-1).add_(1.0 - mask)
+        inverse, log_det = _spd_inverse(masked)
+        inverse = inverse * both
+        flat = inverse.view(time * batch * obs, obs)
         shape = (time, batch, obs, state)
-        gain = torch.where(
-            reset.unsqueeze(-1),
-            (flat @ initial_cross.t()).view(shape),
-            (flat @ cross.t()).view(shape),
+        gain = torch.lerp(
+            (flat @ cross.t()).view(shape), (flat @ initial_cross.t()).view(shape), at_reset
         )
 
         predicted, filtered, inputs, hidden = _run(
@@ -363,7 +368,7 @@ class InformationRecurrence(torch.autograd.Function):
         (residual, activation, precision, gathered, evidence) = args[:5]
         reset, restart, restart_mean, start, drive, initial_mean, first, *rest = args[5:]
         steps = _Steps(residual, activation, first, tuple(rest))
-        C, log_det, _ = _spd_factor(precision)
+        C, log_det = _spd_inverse(precision)
         # precision, gathered and evidence come in float64: inverted in float32 with R at its floor
         # they lose most digits. What the loop needs is well scaled and goes back to its dtype.
         D = (C @ gathered).to(start.dtype)

@@ -10,13 +10,13 @@ from torch import Tensor, nn
 from torchrl_drbpn.functional import (
     Belief,
     FilterOutput,
-    Form,
     MeanNetwork,
     StateSpace,
     filter_sequence,
     filter_step,
     predict_step,
 )
+from torchrl_drbpn.functional.model import Form
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
@@ -203,6 +203,7 @@ class BeliefFilter(nn.Module):
             observed,
             reset,
             return_cov=return_cov,
+            form=self.form,
         )
         self._check_values(out, observation, observed)
         return out

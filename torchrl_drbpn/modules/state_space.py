@@ -20,6 +20,7 @@ from torchrl_drbpn.functional import (
 __all__ = ["GaussianTransition", "LinearGaussianEmission"]
 
 CovKind = Literal["diag", "full"]
+_MIN_INITIAL_STD = 1e-3
 
 
 def _check_dim(name: str, value: int) -> int:
@@ -99,7 +100,12 @@ def initial_covariance(
     dtype: torch.dtype | None,
 ) -> nn.Module:
     """Make the learned covariance of the initial belief; calling it returns ``(dim, dim)``."""
-    return _Covariance(dim, kind, init_std, min_std=1e-3, device=device, dtype=dtype)
+    _check_choice("initial_cov", kind, ("diag", "full"))
+    if not init_std > _MIN_INITIAL_STD:
+        raise ValueError(
+            f"`initial_std` must be above its floor of {_MIN_INITIAL_STD}, got {init_std}."
+        )
+    return _Covariance(dim, kind, init_std, _MIN_INITIAL_STD, device=device, dtype=dtype)
 
 
 class GaussianTransition(nn.Module):

@@ -1,0 +1,134 @@
+"""Where does the time of one PPO update go?
+
+One rollout is collected; then updates on one of its minibatches are timed part by part, for the
+recipe's defaults, for experiment=paper, and for the same agent without a belief (belief=none).
+Parts: filter (both passes of the belief module), heads and loss, the backward pass down to the
+features, the backward pass through the filter, gradient norm and optimiser.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import torch
+from recipe import (
+    Training,
+    add_advantages,
+    assemble,
+    minibatches,
+    settings_of,
+    to_sequences,
+)
+from tensordict import TensorDictBase
+from timing import finish, interleave, parser, start, table
+
+PARTS = (
+    "filter",
+    "heads and loss",
+    "backward, heads and loss",
+    "backward, filter",
+    "optimiser",
+)
+
+
+class Update:
+    """One gradient step, with a clock at the borders of its parts."""
+
+    def __init__(self, training: Training, batch: TensorDictBase, max_norm: float) -> None:
+        self.training, self.batch, self.max_norm = training, batch, max_norm
+        self.parameters = list(training.agent.parameters())
+        self.rows: list[dict[str, float]] = []
+        self._in_filter = 0.0
+        self._features_done: float | None = None
+        training.agent.belief.register_forward_pre_hook(self._enter)
+        training.agent.belief.register_forward_hook(self._leave)
+
+    def _enter(self, *_: Any) -> None:
+        self._entered = time.perf_counter()
+
+    def _leave(self, _module: Any, _inputs: Any, out: Any) -> None:
+        self._in_filter += time.perf_counter() - self._entered
+        features = out.get("features")
+        if features.ndim == 3 and features.requires_grad:
+            # The engine computes this gradient when it has passed loss and heads.
+            features.register_hook(self._mark)
+
+    def _mark(self, _grad: torch.Tensor) -> None:
+        self._features_done = time.perf_counter()
+
+    def __call__(self) -> None:
+        """Take the step and note its times."""
+        loss, optimizer = self.training.loss, self.training.optimizer
+        self._in_filter, self._features_done = 0.0, None
+        begin = time.perf_counter()
+        out = loss(self.batch)
+        total = sum(value for key, value in out.items() if key.startswith("loss"))
+        assert isinstance(total, torch.Tensor)
+        forward = time.perf_counter()
+        optimizer.zero_grad(set_to_none=True)
+        torch.autograd.backward(total)
+        backward = time.perf_counter()
+        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_norm)
+        optimizer.step()
+        end = time.perf_counter()
+        middle = backward if self._features_done is None else self._features_done
+        values = (
+            self._in_filter,
+            forward - begin - self._in_filter,
+            middle - forward,
+            backward - middle,
+            end - backward,
+        )
+        self.rows.append(dict(zip(PARTS, values, strict=True)))
+
+    def median(self, part: str) -> float:
+        """Return the median milliseconds of a part."""
+        return 1e3 * statistics.median(row[part] for row in self.rows)
+
+
+def main() -> None:
+    """Run from the command line."""
+    args = parser(__doc__ or "")
+    args.add_argument("--env", default="walker2d", help="an entry of conf/env")
+    args = args.parse_args()
+    run = start(args)
+    rounds = args.rounds or (2 if args.quick else 60)
+    size = ["collector.num_envs=2", "collector.steps_per_env=16"] if args.quick else []
+    common = [f"env={args.env}", *size]
+    few = ["optim.minibatches=2"] if args.quick else []
+    cases = {
+        "defaults": [*common, *few],
+        "experiment=paper": ["experiment=paper", "env.version=v5", *common, *few],
+        "belief=none": ["belief=none", *common, *few],
+    }
+    updates = {}
+    titles = {}
+    for name, overrides in cases.items():
+        settings = settings_of(*overrides)
+        training = assemble(settings)
+        data = training.collector.rollout()
+        add_advantages(data, training.agent, training.gae)
+        sequences = to_sequences(data, training.loss, settings.optim.sequence_length)
+        batch = next(minibatches(sequences, settings.optim.minibatches, training.generator))
+        updates[name] = Update(training, batch, settings.optim.max_grad_norm)
+        titles[name] = (
+            f"{name} ({batch.shape[0]} x {batch.shape[1]} = {batch.numel()} frames a minibatch)"
+        )
+        training.collector.shutdown()
+    times = interleave(updates, rounds=rounds, warmup=3)
+    results = {}
+    for name, update in updates.items():
+        total = 1e3 * times.median(name)
+        rows = [(part, update.median(part), 100 * update.median(part) / total) for part in PARTS]
+        table(titles[name], ("", "ms", "%"), [*rows, ("whole update", total, 100.0)])
+        results[name] = {part: value for part, value, _ in rows} | {"whole": total}
+    print()
+    for name in ("defaults", "experiment=paper"):
+        print(f"{name} / belief=none: {times.ratio(name, 'belief=none'):.2f}")
+    finish(args, run, results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""Draw an agent's belief: ``python recipes/plot_belief.py run=<folder> point=mcar:0.5``.
+
+The last checkpoint of the run acts for one episode under its corruption. The figure shows, for the
+sensors that miss most, what complete sensors would have shown, what arrived, and the belief with
+its 95 % interval (diagonal of H P H'), under pictures of the robot where this machine can draw them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+import torch
+from assembly.belief_figure import draw_belief, frame_steps, most_missing, save_figure
+from assembly.console import run_or_explain, say
+from assembly.errors import UserError
+from assembly.frames import render_poses
+from assembly.points import read_point
+from assembly.recording import Recording, record_episode
+from assembly.settings import check_mode
+from assembly.trained import load_trained_agent
+from omegaconf import DictConfig, OmegaConf
+
+_FRAME_HEIGHT = 330  # pixels
+
+
+def run(config: dict[str, Any]) -> int:
+    """Record an episode and draw it.
+
+    Args:
+        config: see conf/plot_belief.yaml.
+
+    Returns:
+        The exit status.
+    """
+    if config["run"] is None:
+        raise UserError("`run` must name a run folder: run=runs/<folder>.")
+    if config["steps"] < 2 or config["start"] < 0 or config["frames"] < 0:
+        raise UserError("`steps` must be 2 or more, `start` and `frames` 0 or more.")
+    check_mode(config["mode"])
+    torch.set_num_threads(config["threads"])
+    folder = Path(config["run"])
+    out = Path(config["out"] or folder / "belief.png")
+    if not out.parent.is_dir():
+        raise UserError(f"`out` must lie in an existing folder, got {out}.")
+    trained = load_trained_agent(folder)
+    missingness = read_point(str(config["point"]), trained.settings.missingness)
+    recording = record_episode(
+        trained,
+        missingness,
+        mode=config["mode"],
+        seed=config["seed"],
+        start=config["start"],
+        steps=config["steps"],
+    )
+    sensors = chosen_sensors(recording, config["sensors"])
+    frames = _frames(recording, config["frames"])
+    figure = draw_belief(
+        recording,
+        sensors,
+        frames,
+        title=f"{recording.task} after {trained.frames:,} training steps, {config['mode']} actions",
+    )
+    save_figure(figure, out)
+    say(
+        f"steps {config['start']} to {config['start'] + len(recording.poses) - 1}, missing "
+        f"{recording.missing_ratio:.3f}, the 95 % intervals hold {100 * recording.coverage:.1f} % "
+        f"of the missing entries; written: {out}"
+    )
+    return 0
+
+
+def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]) -> list[int]:
+    """Return the sensors to draw.
+
+    Args:
+        recording: of an episode.
+        wanted: how many of those that miss most, or names or numbers of components.
+
+    Returns:
+        Indices of components.
+
+    Raises:
+        UserError: if there is no such sensor.
+    """
+    names = recording.names
+    if isinstance(wanted, int):
+        if wanted < 1:
+            raise UserError(f"`sensors` must be 1 or more, or a list, got {wanted}.")
+        return most_missing(recording, wanted)
+    indices = []
+    for item in [wanted] if isinstance(wanted, str) else wanted:
+        index = names.index(item) if item in names else item
+        if not isinstance(index, int) or not 0 <= index < len(names):
+            shown = ", ".join(f"{i} {name}" for i, name in enumerate(names[:20]))
+            more = ", ..." if len(names) > 20 else ""
+            raise UserError(f"`sensors` must be among {shown}{more}; got {item!r}.")
+        indices.append(index)
+    return indices
+
+
+def _frames(recording: Recording, count: int) -> list[Any]:
+    """Draw the robot, or say in one line why that can't be done here."""
+    if not count:
+        return []
+    steps = frame_steps(min(count, len(recording.poses)), len(recording.poses))
+    try:
+        return render_poses(
+            recording.model,
+            recording.task,
+            [recording.poses[step] for step in steps],
+            width=_FRAME_HEIGHT * 3 // 4,
+            height=_FRAME_HEIGHT,
+        )
+    except RuntimeError as error:
+        say(f"no pictures of the robot, off-screen rendering failed: {error}")
+        return []
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="plot_belief")
+def main(config: DictConfig) -> None:
+    """Start from the command line."""
+    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    status = run_or_explain(lambda: run(plain))
+    if status:
+        sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()
