@@ -11,7 +11,7 @@ from __future__ import annotations
 import gymnasium
 import torch
 from recipe import assemble, settings_of
-from timing import finish, interleave, parser, start, table, verdict
+from timing import CLOCKS, finish, interleave, parser, start, table, verdict
 from torchrl.collectors import Collector
 from torchrl.envs import InitTracker, RewardSum, StepCounter, TransformedEnv
 from torchrl.modules import RandomPolicy
@@ -130,7 +130,7 @@ def main() -> None:
         rows,
     )
     for name, (must, aim) in TARGETS.items():
-        print(verdict(name, shares[name], must, aim))
+        print(verdict(name, shares[name], must, aim, quick=args.quick))
     for collector in collectors.values():
         collector.shutdown()
     results = {

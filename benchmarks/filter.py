@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import torch
 from tensordict import TensorDict
-from timing import Times, finish, interleave, parser, start, table, verdict
+from timing import CLOCKS, Times, finish, interleave, parser, start, table, verdict
 from torch import nn
 from torchrl.modules import GRUModule, LSTMModule, set_recurrent_mode
 
@@ -187,7 +187,7 @@ def main() -> None:
             ours = next(iter(times.seconds))
             row[f"{level} ratio"] = times.ratio(ours, base)
             if target is not None and level == "TensorDict":
-                print(verdict(f"{ours} / {base}", row[f"{level} ratio"], *target))
+                print(verdict(f"{ours} / {base}", row[f"{level} ratio"], *target, quick=args.quick))
         results.append(row)
     print("\nAll ratios to GRU")
     for row in results:

@@ -12,9 +12,9 @@ from timing import ROOT
 if str(ROOT / "recipes") not in sys.path:
     sys.path.insert(0, str(ROOT / "recipes"))
 
-from assembly.rollout import add_advantages, minibatches, to_sequences  # noqa: E402
-from assembly.settings import read_settings  # noqa: E402
-from assembly.training import Training, assemble, train_rollout  # noqa: E402
+from assembly.rollout import add_advantages, minibatches, to_sequences
+from assembly.settings import read_settings
+from assembly.training import Training, assemble, train_rollout
 
 if TYPE_CHECKING:
     from assembly.settings import Settings

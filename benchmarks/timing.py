@@ -26,6 +26,8 @@ import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 
+CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "cpu": time.process_time}
+
 _PACKAGES = (
     "torch",
     "torchrl",
@@ -73,6 +75,7 @@ def interleave(
     rounds: int,
     warmup: int = 2,
     sample_seconds: float = 0.0,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Times:
     """Time candidates against each other.
 
@@ -81,6 +84,7 @@ def interleave(
         rounds: samples of each candidate.
         warmup: calls of each candidate before the first sample.
         sample_seconds: a sample repeats the call until it lasts about this long; 0: one call.
+        clock: what is read, see ``--clock``.
 
     Returns:
         The times of one call.
@@ -93,9 +97,9 @@ def interleave(
         if not sample_seconds:
             repeats[name] = 1
             continue
-        start = time.perf_counter()
+        start = clock()
         candidates[name]()
-        once = time.perf_counter() - start
+        once = clock() - start
         repeats[name] = max(1, round(sample_seconds / max(once, 1e-9)))
     times = Times({name: [] for name in names})
     collecting = gc.isenabled()
@@ -106,10 +110,10 @@ def interleave(
             for name in names[shift:] + names[:shift]:
                 call, count = candidates[name], repeats[name]
                 gc.collect(0)
-                start = time.perf_counter()
+                start = clock()
                 for _ in range(count):
                     call()
-                times.seconds[name].append((time.perf_counter() - start) / count)
+                times.seconds[name].append((clock() - start) / count)
     finally:
         if collecting:
             gc.enable()
@@ -123,13 +127,20 @@ def parser(description: str) -> argparse.ArgumentParser:
         description: the docstring of the benchmark.
 
     Returns:
-        A parser with ``--rounds``, ``--threads``, ``--quick`` and ``--json``.
+        A parser with ``--rounds``, ``--threads``, ``--clock``, ``--quick`` and ``--json``.
     """
     out = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     out.add_argument("--rounds", type=int, default=None, help="samples of each candidate")
     out.add_argument("--threads", type=int, default=1, help="threads of torch (default 1)")
+    out.add_argument(
+        "--clock",
+        choices=CLOCKS,
+        default="wall",
+        help="wall: elapsed time; cpu: CPU time of this process, which other jobs disturb less "
+        "(one thread only: the seconds of several threads add up)",
+    )
     out.add_argument("--quick", action="store_true", help="smallest sizes: only shows that it runs")
     out.add_argument("--json", type=Path, default=None, help="also write the numbers to this file")
     return out
@@ -156,6 +167,7 @@ def start(args: argparse.Namespace) -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": versions,
         "threads": torch.get_num_threads(),
+        "clock": args.clock,
         "cores": os.cpu_count(),
         "cpu": _cpu(),
         "load": round(os.getloadavg()[0], 2),
@@ -165,7 +177,7 @@ def start(args: argparse.Namespace) -> dict[str, Any]:
     print(f"# python {run['python']}, " + ", ".join(f"{k} {v}" for k, v in versions.items()))
     print(
         f"# {run['cpu']}, {run['cores']} cores, torch threads {run['threads']}, "
-        f"load average before the run {run['load']}"
+        f"{run['clock']} clock, load average before the run {run['load']}"
     )
     return run
 
@@ -202,7 +214,7 @@ def _cell(value: object) -> str:
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def verdict(name: str, value: float, must: float, aim: float) -> str:
+def verdict(name: str, value: float, must: float, aim: float, *, quick: bool = False) -> str:
     """Say whether a target is reached.
 
     Args:
@@ -210,6 +222,7 @@ def verdict(name: str, value: float, must: float, aim: float) -> str:
         value: the figure.
         must: the target to reach; above ``aim`` where smaller is better, below where larger is.
         aim: the target to hope for.
+        quick: whether the sizes were those of ``--quick``, which say nothing about the target.
 
     Returns:
         One line.
@@ -218,6 +231,8 @@ def verdict(name: str, value: float, must: float, aim: float) -> str:
     reached_must, reached_aim = (
         (value <= must, value <= aim) if smaller else (value >= must, value >= aim)
     )
+    if quick:
+        return f"{name}: {value:.3g} (--quick: not to be held against the targets)"
     word = "aim reached" if reached_aim else "must reached" if reached_must else "missed"
     return f"{name}: {value:.3g} (must {must:g}, aim {aim:g}: {word})"
 

@@ -22,7 +22,7 @@ from recipe import (
     to_sequences,
 )
 from tensordict import TensorDictBase
-from timing import finish, interleave, parser, start, table
+from timing import CLOCKS, finish, interleave, parser, start, table
 
 PARTS = (
     "filter",

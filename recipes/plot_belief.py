@@ -1,8 +1,8 @@
 """Draw an agent's belief: ``python recipes/plot_belief.py run=<folder> point=mcar:0.5``.
 
-The last checkpoint of the run acts for one episode under its corruption. The figure shows, for the
-sensors that miss most, what complete sensors would have shown, what arrived, and the belief with
-its 95 % interval (diagonal of H P H'), under pictures of the robot where this machine can draw them.
+The last checkpoint of the run acts for one episode. For the sensors that miss most, the figure
+shows what complete sensors would have shown, what arrived, and the belief with its 95 % interval
+(diagonal of H P H'), under pictures of the robot where this machine can draw them.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ def run(config: dict[str, Any]) -> int:
     check_mode(config["mode"])
     torch.set_num_threads(config["threads"])
     folder = Path(config["run"])
+    trained = load_trained_agent(folder)
     out = Path(config["out"] or folder / "belief.png")
     if not out.parent.is_dir():
         raise UserError(f"`out` must lie in an existing folder, got {out}.")
-    trained = load_trained_agent(folder)
     missingness = read_point(str(config["point"]), trained.settings.missingness)
     recording = record_episode(
         trained,
@@ -64,7 +64,7 @@ def run(config: dict[str, Any]) -> int:
         frames,
         title=f"{recording.task} after {trained.frames:,} training steps, {config['mode']} actions",
     )
-    save_figure(figure, out)
+    save_figure(figure, out, dpi=120)
     say(
         f"steps {config['start']} to {config['start'] + len(recording.poses) - 1}, missing "
         f"{recording.missing_ratio:.3f}, the 95 % intervals hold {100 * recording.coverage:.1f} % "

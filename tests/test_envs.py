@@ -10,72 +10,27 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+import sys
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from env_tools import TASKS, play, random_actions
 from gymnasium import spaces
 from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
-from torchrl_drbpn.envs import GymnasiumBatchEnv
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
 # Version 4 is tested on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date")
-
-TASKS = [
-    f"{name}-{version}"
-    for name in [
-        "Ant",
-        "HalfCheetah",
-        "Hopper",
-        "Humanoid",
-        "InvertedDoublePendulum",
-        "InvertedPendulum",
-        "Reacher",
-        "Swimmer",
-        "Walker2d",
-    ]
-    for version in ("v4", "v5")
-]
 
 
 @pytest.fixture(autouse=True)
 def _own_directory(tmp_path, monkeypatch):
     # MuJoCo writes the warnings of a model file into the current directory.
     monkeypatch.chdir(tmp_path)
-
-
-def random_actions(env, steps, seed=0, scale=1.0):
-    """Actions from a generator of our own, some of them outside the Box where scale > 1."""
-    generator = torch.Generator().manual_seed(seed)
-    low, high = env.action_spec.space.low, env.action_spec.space.high
-    draws = torch.rand((steps, *low.shape), generator=generator)
-    return scale * (low + (high - low) * draws)
-
-
-KEYS = ("observation", "reward", "terminated", "truncated")
-
-
-def play(env, tensordict, actions):
-    """Step with `actions`, resetting what ends; return observations, rewards and flags."""
-    seen = []
-    for action in actions:
-        tensordict.set("action", action)
-        stepped, tensordict = env.step_and_maybe_reset(tensordict)
-        following = stepped["next"]
-        seen.append(
-            torch.cat(
-                [
-                    following[key].double()
-                    for key in ("observation", "reward", "terminated", "truncated")
-                ]
-                + [tensordict["observation"].double()],
-                -1,
-            )
-        )
-    return torch.stack(seen), tensordict
 
 
 # The same trajectories as Gymnasium's ----------------------------------------------------------
@@ -506,6 +461,12 @@ def test_closing_twice_is_an_error_unless_allowed():
     env.close(raise_if_closed=False)
     with pytest.raises(RuntimeError, match="closed"):
         env.close()
+
+
+def test_the_environment_over_envpool_names_its_extra_where_envpool_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchrl-drbpn\[envpool\]'"):
+        EnvPoolBatchEnv("Walker2d-v5", 2)
 
 
 @pytest.mark.gpu

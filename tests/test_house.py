@@ -38,7 +38,7 @@ OUTER = {
     "functional": {"torch"},
     "modules": HOST,
     "transforms": HOST,
-    "envs": HOST | {"numpy", "gymnasium", "mujoco"},
+    "envs": HOST | {"numpy", "gymnasium", "mujoco", "envpool"},
     "objectives": HOST,
 }
 

@@ -3,12 +3,13 @@
 from importlib.metadata import PackageNotFoundError, version
 
 from torchrl_drbpn import functional
-from torchrl_drbpn.envs import GymnasiumBatchEnv
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 from torchrl_drbpn.modules import (
     BeliefFilter,
     BeliefFilterModule,
     GaussianTransition,
     LinearGaussianEmission,
+    PolicyStep,
 )
 from torchrl_drbpn.objectives import BeliefModelLoss, DRBPNLoss
 from torchrl_drbpn.transforms import (
@@ -33,6 +34,7 @@ __all__ = [
     "BeliefFilterModule",
     "BeliefModelLoss",
     "DRBPNLoss",
+    "EnvPoolBatchEnv",
     "FillLastObserved",
     "GaussianTransition",
     "GymnasiumBatchEnv",
@@ -41,6 +43,7 @@ __all__ = [
     "ObservationMissingness",
     "ObservationNoise",
     "ObservedFromNaN",
+    "PolicyStep",
     "PreviousAction",
     "RunningReturnScale",
     "SensorReduction",

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from assembly.recording import INTERVAL_95, Recording
 
-_TRUTH, _ARRIVED, _BELIEF, _MISSING = "#4d4d4d", "#111111", "#1f6fb4", "#f6d5c8"
+_TRUTH, _ARRIVED, _BELIEF, _MISSING = "#222222", "#111111", "#1f77c4", "#f8ddd2"
+_DASHES = (0, (3, 1.5))
 _WIDTH_INCHES, _PANEL_INCHES, _STRIP_INCHES, _MASK_INCHES = 10.0, 1.05, 1.55, 0.75
 STYLE = {
     "font.size": 9.5,
@@ -103,7 +104,7 @@ def frame_steps(count: int, steps: int) -> list[int]:
     return [int((i + 0.5) * steps / count) for i in range(count)]
 
 
-def save_figure(figure: Figure, path: Path, *, dpi: int = 150) -> None:
+def save_figure(figure: Figure, path: Path, *, dpi: int) -> None:
     """Write a figure whole or not at all.
 
     Args:
@@ -169,10 +170,10 @@ def _draw_sensor(axis: Any, recording: Recording, sensor: int) -> None:
         axis.axvspan(time[start] - 0.5, time[stop - 1] + 0.5, color=_MISSING, lw=0, zorder=0)
     mean, band = recording.estimate[:, sensor], INTERVAL_95 * recording.std[:, sensor]
     axis.fill_between(time, mean - band, mean + band, color=_BELIEF, alpha=0.3, lw=0, zorder=2)
-    axis.plot(time, recording.complete[:, sensor], color=_TRUTH, lw=1.0, ls=(0, (4, 1.5)), zorder=3)
-    axis.plot(time, mean, color=_BELIEF, lw=1.3, zorder=4)
+    axis.plot(time, mean, color=_BELIEF, lw=2.2, alpha=0.75, zorder=3)
+    axis.plot(time, recording.complete[:, sensor], color=_TRUTH, lw=0.9, ls=_DASHES, zorder=4)
     axis.plot(
-        time[seen], recording.arrived[seen, sensor], ".", color=_ARRIVED, ms=3.4, mew=0, zorder=5
+        time[seen], recording.arrived[seen, sensor], ".", color=_ARRIVED, ms=4.5, mew=0, zorder=5
     )
     missing = 100 * (1 - seen.mean())
     axis.set_title(f"{recording.names[sensor]}  ({missing:.0f} % missing)")
@@ -189,14 +190,12 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
 def _legend() -> list[Any]:
     line = mpl.lines.Line2D
     return [
-        line([], [], color=_TRUTH, lw=1.0, ls=(0, (4, 1.5)), label="true value, unknown to the agent"),
+        line([], [], color=_TRUTH, lw=0.9, ls=_DASHES, label="true value, unknown to the agent"),
         line([], [], color=_ARRIVED, marker=".", ls="", ms=7, mew=0, label="what arrived"),
         Patch(color=_MISSING, label="nothing arrived"),
-        (
-            Patch(
-                facecolor=(*mpl.colors.to_rgb(_BELIEF), 0.3),
-                edgecolor=_BELIEF,
-                label="belief and its 95 % interval",
-            )
+        Patch(
+            facecolor=(*mpl.colors.to_rgb(_BELIEF), 0.3),
+            edgecolor=_BELIEF,
+            label="belief and its 95 % interval",
         ),
     ]

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 
 # Tasks that lie flat are looked at from above; the others from the side.
 _FROM_ABOVE = ("Reacher", "Swimmer")
-_SIDE = {"azimuth": 90.0, "elevation": -6.0}
-_ABOVE = {"azimuth": 90.0, "elevation": -90.0}
-# Size of a picture's height in robot sizes, as MuJoCo computes them for the model at rest.
-_DISTANCE = 2.1
+_SIDE, _ABOVE = -5.0, -90.0  # elevation of the camera, degrees
+_ROOM = 1.45  # distance of the camera in sizes of the robot at rest
 
 
 def render_poses(
@@ -47,39 +45,44 @@ def render_poses(
         os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed
     plain = _on_white(model)
     data = mujoco.MjData(plain)
+    size, middle = _size_at_rest(plain, data)
+    flat = task.split("-")[0] in _FROM_ABOVE
     try:
-        from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+        from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
 
-        renderer = MujocoRenderer(
-            plain,
-            data,
-            default_cam_config=_camera(plain, task),
-            width=width,
-            height=height,
-            camera_id=-1,
-        )
+        viewer = OffScreenViewer(plain, data, width, height)
+        camera = viewer.cam
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.distance, camera.azimuth = _ROOM * size, 90.0
+        camera.elevation = _ABOVE if flat else _SIDE
         pictures = []
         for position, velocity in poses:
             data.qpos[:], data.qvel[:] = position, velocity
             mujoco.mj_forward(plain, data)
-            pictures.append(np.asarray(renderer.render("rgb_array")).copy())
-        renderer.close()
+            # Along with the robot, but not up and down with it: the ground stays where it is.
+            camera.lookat[:] = (*_center(data)[:2], middle)
+            pictures.append(np.asarray(viewer.render("rgb_array")).copy())
+        viewer.close()
     except Exception as error:  # each OpenGL back end fails in its own way
         reason = " ".join(str(error).split()) or type(error).__name__
         raise RuntimeError(reason[:200]) from error
     return pictures
 
 
-def _camera(model: Any, task: str) -> dict[str, Any]:
-    """Follow the first body from the side, or from above."""
-    flat = task.split("-")[0] in _FROM_ABOVE
-    moving = model.nbody > 1
-    return {
-        "type": mujoco.mjtCamera.mjCAMERA_TRACKING,
-        "trackbodyid": 1 if moving else 0,
-        "distance": _DISTANCE * float(model.stat.extent),
-        **(_ABOVE if flat else _SIDE),
-    }
+def _center(data: Any) -> NDArray[np.float64]:
+    """Return the centre of mass of everything that moves."""
+    return np.asarray(data.subtree_com[0]).copy()
+
+
+def _size_at_rest(model: Any, data: Any) -> tuple[float, float]:
+    """Return the largest extent of the robot in its initial pose, and half its height, metres."""
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_forward(model, data)
+    moving = np.asarray(model.geom_bodyid) > 0
+    radius = np.asarray(model.geom_rbound)[moving, None]
+    low = (np.asarray(data.geom_xpos)[moving] - radius).min(0)
+    high = (np.asarray(data.geom_xpos)[moving] + radius).max(0)
+    return float((high - low).max()), float((high + low)[2] / 2)
 
 
 def _on_white(model: Any) -> Any:
@@ -96,7 +99,7 @@ def _on_white(model: Any) -> Any:
         if plain.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             pixels[:] = 255
         elif texture in textures:
-            pixels[:] = 215 + (pixels.astype(int) * 40 // 255).astype(np.uint8)
+            pixels[:] = 165 + (pixels.astype(int) * 45 // 255).astype(np.uint8)
     for material in floor:
         plain.mat_reflectance[material] = 0
         plain.mat_rgba[material] = 1

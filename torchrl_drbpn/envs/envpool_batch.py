@@ -120,15 +120,22 @@ class EnvPoolBatchEnv(BatchedSimulators):
 
     def _make_pool(self) -> None:
         """Make the simulators with the pending seeds, or with fresh ones where there are none."""
+        envpool = _import_envpool()
+        config: dict[str, Any] = {}
+        if hasattr(envpool.make_spec(self.env_id).config, "post_constraint"):
+            # Gymnasium computes contact forces in every version, EnvPool by default in v5 only:
+            # those in the observation of Humanoid-v4 would stay 0.
+            config["post_constraint"] = True
         fresh = np.random.SeedSequence().generate_state(self.num_envs)
         words = np.where(self._seeds == NO_SEED, fresh, self._seeds).astype(np.uint32)
-        self._pool = _import_envpool().make_gymnasium(
+        self._pool = envpool.make_gymnasium(
             self.env_id,
             num_envs=self.num_envs,
             # EnvPool takes signed numbers of 32 bits and feeds their bits to its generators.
             env_seed=words.view(np.int32),
             num_threads=self.num_threads,
             max_episode_steps=_NO_LIMIT,
+            **config,
         )
 
     def _set_seed(self, seed: int | None) -> None:

@@ -2,6 +2,13 @@
 
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
+from torchrl_drbpn.modules.export import PolicyStep
 from torchrl_drbpn.modules.state_space import GaussianTransition, LinearGaussianEmission
 
-__all__ = ["BeliefFilter", "BeliefFilterModule", "GaussianTransition", "LinearGaussianEmission"]
+__all__ = [
+    "BeliefFilter",
+    "BeliefFilterModule",
+    "GaussianTransition",
+    "LinearGaussianEmission",
+    "PolicyStep",
+]

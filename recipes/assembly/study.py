@@ -1,0 +1,527 @@
+"""What finished runs left behind, read as one study and summed up over seeds."""
+
+from __future__ import annotations
+
+import csv
+import glob
+import itertools
+import json
+import math
+import os
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from assembly.errors import UserError
+from assembly.run_folder import read_config
+from assembly.settings import MissingnessSettings, Settings, read_settings
+
+Row = dict[str, Any]
+# What may differ between the runs of one mean: it changes no number that is reported.
+_NOT_COMPARED = ("seed", "threads", "resume", "logger", "checkpoint", "evaluation")
+
+
+@dataclass(frozen=True)
+class StudyRun:
+    """One run folder, read.
+
+    Attributes:
+        name: of the folder, as short as tells it from the others of the study.
+        config: its configuration, plain containers.
+        settings: the same, checked.
+        versions: what it was made with.
+        training: rows of metrics.csv, numbers; None where a cell is empty.
+        evaluations: rows of :func:`_evaluations`.
+    """
+
+    name: str
+    config: Mapping[str, Any]
+    settings: Settings
+    versions: Mapping[str, str]
+    training: list[Row]
+    evaluations: list[Row]
+
+    @property
+    def frames(self) -> int:
+        """Return the environment steps that the run has taken."""
+        return int(self.training[-1]["frames"])
+
+    @property
+    def finished(self) -> bool:
+        """Return whether it has taken all its steps and made its final evaluation."""
+        s = self.settings
+        evaluated = any(row["source"] == "final" for row in self.evaluations)
+        return self.frames >= s.total_frames and (evaluated or not s.evaluation.final_episodes)
+
+    @property
+    def group(self) -> Row:
+        """Return what the runs of one mean have in common."""
+        s = self.settings
+        return {
+            "task": s.env.env_id,
+            "belief": str(s.belief.get("name", "")),
+            "trained_on": point_name(s.missingness),
+            "noise_sigma": s.noise.sigma,
+        }
+
+    @property
+    def missing_ratio(self) -> float:
+        """Return the share of entries that did not arrive in training."""
+        return _mean(row["missing_ratio"] for row in self.training)
+
+
+def point_name(missingness: MissingnessSettings) -> str:
+    """Return missingness as ``recipes/evaluate.py`` takes it, such as ``mcar:0.5``.
+
+    Args:
+        missingness: mechanism and eta.
+
+    Returns:
+        ``mechanism:eta``.
+    """
+    eta = 0.0 if missingness.mechanism == "none" else missingness.eta
+    return f"{missingness.mechanism}:{eta:g}"
+
+
+# Reading --------------------------------------------------------------------------------------
+
+
+def find_folders(wanted: str | Sequence[str]) -> list[Path]:
+    """Return run folders in a fixed order.
+
+    Args:
+        wanted: folders or patterns.
+
+    Returns:
+        Folders, each once, sorted. A pattern gives the folders with a config.yaml.
+
+    Raises:
+        UserError: if there is none.
+    """
+    found: set[Path] = set()
+    for text in [wanted] if isinstance(wanted, str) else wanted:
+        if glob.has_magic(str(text)):
+            matches = [Path(p) for p in glob.glob(str(text), recursive=True)]
+            runs = [path for path in matches if (path / "config.yaml").is_file()]
+            if not runs:
+                raise UserError(f"`run` must name run folders, {text} matches none.")
+            found.update(runs)
+        else:
+            found.add(Path(text))
+    if not found:
+        raise UserError("`run` must name run folders: 'run=[runs/a,runs/b]' or 'run=runs/*'.")
+    # One folder given twice, by a name and by a pattern, is one run.
+    unique = {path.resolve(): path for path in sorted(found)}
+    return sorted(unique.values())
+
+
+def read_study(folders: Sequence[Path], *, unfinished: bool = False) -> list[StudyRun]:
+    """Read runs, and check that they make a study.
+
+    Args:
+        folders: run folders.
+        unfinished: whether runs that have not come to their end are taken.
+
+    Returns:
+        The runs, sorted by task, belief, training corruption, seed.
+
+    Raises:
+        UserError: if a folder can't be read, a run is not finished, or runs of one mean differ
+            in more than their seed or share it.
+    """
+    common = Path(os.path.commonpath([folder.resolve().parent for folder in folders]))
+    runs = [_read_run(f, f.resolve().relative_to(common).as_posix()) for f in folders]
+    for run in runs:
+        if not run.finished and not unfinished:
+            raise UserError(
+                f"`{run.name}` has {run.frames:,} of {run.settings.total_frames:,} steps or lacks "
+                "its final evaluation: finish it with resume=<folder>, or pass unfinished=true."
+            )
+    runs.sort(key=lambda run: (*run.group.values(), run.settings.seed, run.name))
+    for members in grouped(runs):
+        _check_group(members)
+    return runs
+
+
+def grouped(runs: Sequence[StudyRun]) -> list[list[StudyRun]]:
+    """Return the runs that one mean is taken over, one list each.
+
+    Args:
+        runs: of a study.
+
+    Returns:
+        Groups, in the order of the runs.
+    """
+    groups: dict[tuple[Any, ...], list[StudyRun]] = {}
+    for run in runs:
+        groups.setdefault(tuple(run.group.values()), []).append(run)
+    return list(groups.values())
+
+
+def _check_group(members: Sequence[StudyRun]) -> None:
+    first, seeds = members[0], {}
+    for run in members:
+        twin = seeds.setdefault(run.settings.seed, run)
+        if twin is not run:
+            raise UserError(
+                f"`{twin.name}` and `{run.name}` are the same task, belief and corruption with the "
+                f"same seed {run.settings.seed}: report them apart."
+            )
+        differing = _differing(first.config, run.config)
+        if differing:
+            raise UserError(
+                f"`{first.name}` and `{run.name}` differ in {', '.join(differing[:5])}: one mean "
+                "over both would say nothing. Report them apart."
+            )
+
+
+def _differing(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    one, other = flat(first), flat(second)
+    keys = sorted(one.keys() | other.keys())
+    compared = [key for key in keys if key.split(".")[0] not in _NOT_COMPARED]
+    return [key for key in compared if one.get(key) != other.get(key)]
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return a configuration as one level of dotted keys.
+
+    Args:
+        config: nested mappings.
+        prefix: put before every key.
+
+    Returns:
+        Values by dotted key.
+    """
+    out: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            out |= flat(value, f"{prefix}{key}.")
+        else:
+            out[f"{prefix}{key}"] = value
+    return out
+
+
+def _read_run(folder: Path, name: str) -> StudyRun:
+    config = read_config(folder)
+    try:
+        settings = read_settings(config)
+    except UserError as error:
+        raise UserError(f"`{folder / 'config.yaml'}`: {error}") from error
+    training = _read_csv(folder / "metrics.csv", {"frames", "return", "missing_ratio"})
+    if not training:
+        raise UserError(f"`{folder}` holds no finished rollout: metrics.csv is empty.")
+    return StudyRun(
+        name, config, settings, _read_versions(folder), training, _evaluations(folder, settings)
+    )
+
+
+def _read_versions(folder: Path) -> dict[str, str]:
+    path = folder / "versions.json"
+    try:
+        versions = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"`{path}` can't be read: is {folder} a whole run folder?") from error
+    if not isinstance(versions, dict):
+        raise UserError(f"`{path}` must hold versions by name, got {type(versions).__name__}.")
+    return {str(key): str(value) for key, value in versions.items()}
+
+
+def _read_csv(path: Path, needed: set[str]) -> list[Row]:
+    """Return the rows of a table: numbers where they are some, None for an empty cell."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            absent = needed - set(reader.fieldnames or ())
+            rows = [{key: _number(cell) for key, cell in row.items()} for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"`{path}` can't be read: is it in a run folder?") from error
+    if absent:
+        raise UserError(f"`{path}` lacks the columns {', '.join(sorted(absent))}: another table?")
+    return rows
+
+
+def _number(cell: Any) -> Any:
+    if not cell:
+        return None
+    try:
+        return float(cell)
+    except (TypeError, ValueError):
+        return cell
+
+
+def _evaluations(folder: Path, settings: Settings) -> list[Row]:
+    """Return one row an evaluation: those of the run, then those of recipes/evaluate.py."""
+    rows = []
+    path = folder / "evaluation.csv"
+    for row in _read_csv(path, {"frames", "kind", "mode", "return_mean"}) if path.is_file() else []:
+        rows.append(
+            {"source": row["kind"], "point": point_name(settings.missingness)}
+            | {key: row.get(key) for key in _EVALUATED}
+        )
+    path = folder / "points.csv"
+    if path.is_file():
+        rows += _points(_read_csv(path, {"frames", "mechanism", "eta", "mode", "return", "length"}))
+    return rows
+
+
+_EVALUATED = (
+    "frames",
+    "mode",
+    "episodes",
+    "return_mean",
+    "return_std",
+    "length_mean",
+    "missing_ratio",
+    "log_likelihood",
+)
+
+
+def _points(episodes: Sequence[Row]) -> list[Row]:
+    """Sum up the episodes of recipes/evaluate.py, one row a point and kind of action."""
+    together: dict[tuple[Any, ...], dict[Any, Row]] = {}
+    for index, row in enumerate(episodes):
+        eta = 0.0 if row["mechanism"] == "none" else row["eta"]
+        key = (row["frames"], f"{row['mechanism']}:{eta:g}", row["mode"])
+        # A point that was asked for under two names has the same episodes twice.
+        together.setdefault(key, {})[row.get("episode", index)] = row
+    rows = []
+    for (frames, point, mode), by_episode in together.items():
+        found = list(by_episode.values())
+        returns = [row["return"] for row in found]
+        steps = [row["length"] for row in found]
+        arrived = [n * (1 - row["missing_ratio"]) for n, row in zip(steps, found, strict=True)]
+        likelihoods = [row.get("log_likelihood") for row in found]
+        rows.append(
+            {
+                "source": "points",
+                "point": point,
+                "frames": frames,
+                "mode": mode,
+                "episodes": len(found),
+                "return_mean": _mean(returns),
+                "return_std": statistics.stdev(returns) if len(returns) > 1 else 0.0,
+                "length_mean": _mean(steps),
+                # Over all steps and entries, as in evaluation.csv.
+                "missing_ratio": 1 - sum(arrived) / sum(steps),
+                "log_likelihood": (
+                    None
+                    if None in likelihoods
+                    else sum(v * w for v, w in zip(likelihoods, arrived, strict=True))
+                    / max(sum(arrived), 1e-12)
+                ),
+            }
+        )
+    return rows
+
+
+# Tables ---------------------------------------------------------------------------------------
+
+
+def training_rows(run: StudyRun, count: int) -> list[Row]:
+    """Return a learning curve of about ``count`` rows.
+
+    Args:
+        run: the run.
+        count: rows wanted.
+
+    Returns:
+        Rows: the return as it stood (it is a mean over 100 episodes already), means of missing
+        ratio and log-likelihood since the row before, steps per second since then.
+    """
+    rows, total = run.training, len(run.training)
+    count = min(count, total)
+    cuts = [total * i // count for i in range(count + 1)]
+    out = []
+    for start, stop in itertools.pairwise(cuts):
+        part, last = rows[start:stop], rows[stop - 1]
+        out.append(
+            run.group
+            | {
+                "seed": run.settings.seed,
+                "frames": int(last["frames"]),
+                "return": last["return"],
+                "missing_ratio": _mean(row["missing_ratio"] for row in part),
+                "log_likelihood": _mean(row.get("log_likelihood") for row in part),
+                "steps_per_second": _speed(part),
+            }
+        )
+    return out
+
+
+def _speed(rows: Sequence[Row]) -> float | None:
+    """Return frames over seconds; every row holds as many frames as the next."""
+    seconds = [1 / row["steps_per_second"] for row in rows if row.get("steps_per_second")]
+    return len(seconds) / sum(seconds) if seconds else None
+
+
+def evaluation_rows(run: StudyRun) -> list[Row]:
+    """Return every evaluation of a run.
+
+    Args:
+        run: the run.
+
+    Returns:
+        Rows: ``source`` is ``training`` or ``final`` (by the training recipe) or ``points``
+        (by recipes/evaluate.py).
+    """
+    head = run.group | {"seed": run.settings.seed}
+    rows = [head | {**row, "frames": int(row["frames"])} for row in run.evaluations]
+    rows = [row | {"episodes": int(row["episodes"])} for row in rows]
+    order = {"training": 0, "final": 1, "points": 2}
+    rows.sort(key=lambda r: (order[r["source"]], r["frames"], point_order(r["point"]), r["mode"]))
+    return rows
+
+
+def point_order(point: str) -> tuple[str, float]:
+    """Return what points are sorted by: none first, then by mechanism and eta.
+
+    Args:
+        point: ``mechanism:eta``.
+
+    Returns:
+        A key for ``sorted``.
+    """
+    mechanism, _, eta = point.partition(":")
+    return ("" if mechanism == "none" else mechanism, float(eta))
+
+
+_WORDS = {
+    "return_mean": "return",
+    "missing_ratio": "missing ratio",
+    "log_likelihood": "log-likelihood",
+}
+NOTHING_MISSING = "none:0"
+KEPT = "evaluation return kept"  # as a share of the return where nothing is missing
+# What is summed up about a training run: name, and the number of a run.
+_TRAINING_NUMBERS: dict[str, Callable[[StudyRun], float | None]] = {
+    "training return": lambda run: run.training[-1]["return"],
+    "training missing ratio": lambda run: run.missing_ratio,
+    "training log-likelihood": lambda run: _mean(
+        row.get("log_likelihood") for row in run.training[-max(1, len(run.training) // 10) :]
+    ),
+    "training steps/s": lambda run: _speed(run.training),
+}
+
+
+def summary_rows(runs: Sequence[StudyRun]) -> list[Row]:
+    """Return means over seeds with every seed's own number beside them.
+
+    Args:
+        runs: of a study.
+
+    Returns:
+        Rows ``task, belief, trained_on, noise_sigma, quantity, point, mode, seeds, mean, std,
+        per_seed``; std between seeds, empty for one; per_seed ``seed=number`` joined by spaces.
+    """
+    rows = []
+    for members in grouped(runs):
+        for name, number in _TRAINING_NUMBERS.items():
+            rows.append(_summary(members, name, members[0].group["trained_on"], "sampled", number))
+        for point, mode in _evaluated_points(members):
+            for name in _WORDS:
+                words = f"evaluation {_WORDS[name]}"
+
+                def number(
+                    run: StudyRun, name: str = name, at: tuple[str, str] = (point, mode)
+                ) -> float | None:
+                    found = final_evaluation(run, *at)
+                    return found[name] if found else None
+
+                rows.append(_summary(members, words, point, mode, number))
+            if point != NOTHING_MISSING:
+                rows.append(_summary(members, KEPT, point, mode, _kept(point, mode)))
+    return [row for row in rows if row["quantity"] != KEPT or row["mean"] is not None]
+
+
+def _kept(point: str, mode: str) -> Callable[[StudyRun], float | None]:
+    """Return what gives a run's share of its return where nothing is missing."""
+
+    def number(run: StudyRun) -> float | None:
+        here, clean = (final_evaluation(run, p, mode) for p in (point, NOTHING_MISSING))
+        if here is None or clean is None or clean["return_mean"] <= 0:
+            return None  # of a cost, no share can be told
+        return here["return_mean"] / clean["return_mean"]
+
+    return number
+
+
+def _summary(
+    members: Sequence[StudyRun],
+    quantity: str,
+    point: str,
+    mode: str,
+    number: Callable[[StudyRun], float | None],
+) -> Row:
+    values = {run.settings.seed: number(run) for run in members}
+    known = [value for value in values.values() if value is not None]
+    return members[0].group | {
+        "quantity": quantity,
+        "point": point,
+        "mode": mode,
+        "seeds": len(values),
+        # A mean that leaves out a seed would be no mean over the seeds.
+        "mean": _mean(known) if len(known) == len(values) else None,
+        "std": statistics.stdev(known) if len(known) == len(values) > 1 else None,
+        "per_seed": " ".join(f"{seed}={format_number(v)}" for seed, v in sorted(values.items())),
+    }
+
+
+def _evaluated_points(members: Sequence[StudyRun]) -> list[tuple[str, str]]:
+    found = {
+        (row["point"], row["mode"])
+        for run in members
+        for row in run.evaluations
+        if row["source"] != "training"
+    }
+    return sorted(found, key=lambda key: (point_order(key[0]), key[1] != "sampled"))
+
+
+def final_evaluation(run: StudyRun, point: str, mode: str) -> Row | None:
+    """Return the evaluation of a run's last checkpoint at a point.
+
+    Args:
+        run: the run.
+        point: ``mechanism:eta``.
+        mode: ``sampled`` or ``mean``.
+
+    Returns:
+        Its row: that of recipes/evaluate.py where there is one, else the run's own; or None.
+    """
+    found = [
+        row
+        for source in ("points", "final")
+        for row in run.evaluations
+        if (row["source"], row["point"], row["mode"]) == (source, point, mode)
+        and row["frames"] == run.frames
+    ]
+    return found[0] if found else None
+
+
+def format_number(value: Any) -> str:
+    """Return a number in the one way that every table has: six significant digits.
+
+    Args:
+        value: a number, text, or None for an empty cell.
+
+    Returns:
+        Its text.
+    """
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    if isinstance(value, float):
+        # No exponents and no minus before a zero.
+        text = f"{value:.{max(0, 5 - _magnitude(value))}f}"
+        text = text.rstrip("0").rstrip(".") if "." in text else text
+        return "0" if text == "-0" else text
+    return str(value)
+
+
+def _magnitude(value: float) -> int:
+    return math.floor(math.log10(abs(value))) if abs(value) > 1e-12 else 0
+
+
+def _mean(values: Iterable[Any]) -> Any:
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known else None

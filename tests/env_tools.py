@@ -1,0 +1,51 @@
+"""What the tests of every environment over MuJoCo tasks share: the tasks, actions, stepping."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+__all__ = ["TASKS", "play", "random_actions"]
+
+TASKS = [
+    f"{name}-{version}"
+    for name in [
+        "Ant",
+        "HalfCheetah",
+        "Hopper",
+        "Humanoid",
+        "InvertedDoublePendulum",
+        "InvertedPendulum",
+        "Reacher",
+        "Swimmer",
+        "Walker2d",
+    ]
+    for version in ("v4", "v5")
+]
+
+
+def random_actions(env: EnvBase, steps: int, seed: int = 0, scale: float = 1.0) -> torch.Tensor:
+    """Actions from a generator of our own, some of them outside the Box where scale > 1."""
+    generator = torch.Generator().manual_seed(seed)
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    draws = torch.rand((steps, *low.shape), generator=generator)
+    return scale * (low + (high - low) * draws)
+
+
+def play(
+    env: EnvBase, tensordict: TensorDictBase, actions: torch.Tensor | list[torch.Tensor]
+) -> tuple[torch.Tensor, TensorDictBase]:
+    """Step with `actions`, resetting what ends.
+
+    Returns what was seen, shape (steps, num_envs, obs + 3 + obs): the observation, reward,
+    terminated, truncated, and the observation that the next step starts from.
+    """
+    seen = []
+    for action in actions:
+        tensordict.set("action", action)
+        stepped, tensordict = env.step_and_maybe_reset(tensordict)
+        keys = ("observation", "reward", "terminated", "truncated")
+        parts = [stepped["next", key].double() for key in keys]
+        seen.append(torch.cat([*parts, tensordict["observation"].double()], -1))
+    return torch.stack(seen), tensordict

@@ -1,0 +1,240 @@
+"""One decision on plain tensors: what runs on the robot, for torch.export and AOTInductor."""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_drbpn.functional import (
+    MeanNetwork,
+    StateSpace,
+    choose_form,
+    filter_step,
+    filtered_cov,
+    tril_to_vector,
+    zero_missing,
+)
+from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
+
+__all__ = ["PolicyStep"]
+
+
+class PolicyStep(nn.Module):
+    r"""Decide once: update the belief with what arrived, act on it; tensors in, tensors out.
+
+    .. math::
+        m_t = m^-_t + K_t (x_t - H m^-_t - B a_{t-1} - d), \qquad a_t = \mu(m_t)
+
+    Eq. (8), (10), (11) [DRBPN], the same numbers as the belief module followed by the policy's
+    mean action. It is a frozen copy: later training does not reach it. What the parameters alone
+    determine is computed once, here, and kept in buffers: Q H', P_0 H' and both innovation
+    covariances H P H' + R, or in the information form (diagonal R, obs > state) the precisions
+    and the products h_i h_i'. A step is left with one small factorisation, the transition network
+    and the head. A transition of the user's own, or a Q that is a network, is evaluated as it is
+    at every step.
+
+    It has no TensorDict and no branch on values, so ``torch.export.export`` takes it, with a
+    dynamic batch too, and ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time.
+    Observations are those that the belief module reads, normalised if the training's were.
+
+    Args:
+        belief: the belief module.
+        head: maps ``features`` ``(*batch, features)`` to the action ``(*batch, action)``, or to a
+            tuple that begins with it, such as (loc, scale).
+
+    Keyword Args:
+        action_low: smallest action, shape ``(action,)``, action units; None: no limit.
+        action_high: largest action.
+
+    Raises:
+        TypeError: if ``belief`` is no :class:`~torchrl_drbpn.BeliefFilterModule`.
+        ValueError: if only one of the two limits is given.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_drbpn import BeliefFilter, BeliefFilterModule
+        >>> belief = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
+        >>> step = PolicyStep(belief, torch.nn.Linear(5, 2))
+        >>> mean, age = step.initial_state(3)
+        >>> nothing = torch.zeros(3, 5, dtype=torch.bool)
+        >>> first = torch.ones(3, 1, dtype=torch.bool)
+        >>> zeros = torch.zeros(3, 5), nothing, torch.zeros(3, 2)
+        >>> action, mean, age = step(*zeros, first, mean, age)
+        >>> torch.equal(mean, belief.filter.initial_mean.expand(3, 5)), age.flatten().tolist()
+        (True, [1, 1, 1])
+
+    See also :class:`torchrl_drbpn.BeliefFilterModule`, the same with TensorDict keys.
+    """
+
+    action_low: Tensor | None
+    action_high: Tensor | None
+
+    def __init__(
+        self,
+        belief: BeliefFilterModule,
+        head: nn.Module,
+        *,
+        action_low: Tensor | None = None,
+        action_high: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(belief, BeliefFilterModule):
+            raise TypeError(
+                f"`belief` must be a BeliefFilterModule, got {type(belief).__name__}: other belief "
+                "modules have recurrent states of their own."
+            )
+        if (action_low is None) != (action_high is None):
+            raise ValueError("`action_low` and `action_high` must be given together or not at all.")
+        self.policy_input = belief.policy_input
+        self.head = copy.deepcopy(head).requires_grad_(False)
+        filter = copy.deepcopy(belief.filter).requires_grad_(False)
+        with torch.no_grad():
+            model = filter.state_space()
+        self.form = choose_form(model)
+        self.filter = filter if self.form == "loop" else None
+        self.state_dim, self.dtype = filter.state_dim, filter.initial_mean.dtype
+        for name, limit in (("action_low", action_low), ("action_high", action_high)):
+            self.register_buffer(name, None if limit is None else limit.detach().clone())
+        if self.form != "loop":
+            self._keep_model(model)
+        self.eval()
+
+    # ------------------------------------------------------------------ what is computed once
+    def _keep_model(self, model: StateSpace) -> None:
+        """Put the model, and what follows from it, into buffers."""
+        transition = model.transition
+        assert isinstance(transition, MeanNetwork)  # the form says so; for the type checker
+        self.residual, self.activation = transition.residual, transition.activation
+        self.layers = len(transition.weights)
+        for i, (weight, bias) in enumerate(zip(transition.weights, transition.biases, strict=True)):
+            self._keep(f"weight_{i}", weight)
+            self._keep(f"bias_{i}", bias)
+        for name in StateSpace._fields[1:]:
+            self._keep(name, getattr(model, name))
+        # H m + B a + d as one product with (m, a).
+        self._keep("expectation", torch.cat([model.emission_matrix, model.action_matrix], -1))
+        if self.form == "information":
+            model = model.double()
+        H, Q, P0 = model.emission_matrix, model.transition_cov, model.initial_cov
+        assert isinstance(Q, Tensor)
+        if self.form == "innovation":
+            R = model.full_emission_cov()
+            self._keep("cross", H @ Q)
+            self._keep("initial_cross", H @ P0)
+            self._keep("innovation_cov", H @ Q @ H.mT + R)
+            self._keep("initial_innovation_cov", H @ P0 @ H.mT + R)
+            self._keep("eye", torch.eye(H.shape[0], dtype=H.dtype, device=H.device))
+        else:
+            # float64, as in the belief module: the factorisation loses digits where R is small.
+            self._keep("matrix", H)
+            self._keep("inverse_noise", 1.0 / model.emission_cov)
+            self._keep("outer", (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2))
+            self._keep("precision", torch.linalg.inv(Q))
+            self._keep("initial_precision", torch.linalg.inv(P0))
+
+    def _keep(self, name: str, value: Tensor) -> None:
+        self.register_buffer(name, value.detach().clone())
+
+    def _model(self) -> StateSpace:
+        """Return the kept model."""
+        weights = tuple(self.get_buffer(f"weight_{i}") for i in range(self.layers))
+        biases = tuple(self.get_buffer(f"bias_{i}") for i in range(self.layers))
+        network = MeanNetwork(weights, biases, self.residual, self.activation)
+        return StateSpace(network, *(self.get_buffer(name) for name in StateSpace._fields[1:]))
+
+    # ------------------------------------------------------------------ one decision
+    def initial_state(self, batch: int) -> tuple[Tensor, Tensor]:
+        """Return mean and age before the first step, zeros, as the primer does.
+
+        Args:
+            batch: number of robots.
+
+        Returns:
+            mean ``(batch, state)`` and age int64 ``(batch, 1)``.
+        """
+        device = next(self.buffers(), torch.empty(0)).device
+        mean = torch.zeros(batch, self.state_dim, dtype=self.dtype, device=device)
+        return mean, torch.zeros(batch, 1, dtype=torch.int64, device=device)
+
+    def forward(
+        self,
+        observation: Tensor,
+        observed: Tensor,
+        previous_action: Tensor,
+        is_init: Tensor,
+        mean: Tensor,
+        age: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the action and the state of the next step.
+
+        Args:
+            observation: shape ``(batch, obs)``; missing entries may hold anything.
+            observed: bool, shape ``(batch, obs)``, True = arrived.
+            previous_action: shape ``(batch, action)``, zero at the first step.
+            is_init: bool, shape ``(batch, 1)``, True at the first step of an episode.
+            mean: filtered mean of the step before, shape ``(batch, state)``.
+            age: updates since the reset, int64, shape ``(batch, 1)``; an episode starts where
+                ``is_init`` and ``age == 0``.
+
+        Returns:
+            action ``(batch, action)``, filtered mean ``(batch, state)``, ``age + 1``.
+        """
+        reset = is_init & (age == 0)
+        if self.filter is not None:
+            wants_cov = self.policy_input == "mean_cov"
+            out = filter_step(
+                self.filter.state_space(), mean, previous_action, observation, observed,
+                reset.squeeze(-1), return_cov=wants_cov,
+            )  # fmt: skip
+            filtered, cov = out.mean, out.cov
+        else:
+            filtered = self._update(observation, observed, previous_action, reset, mean)
+            cov = None
+            if self.policy_input == "mean_cov":
+                cov = filtered_cov(self._model(), observed, reset.squeeze(-1))
+        features = filtered if cov is None else torch.cat([filtered, tril_to_vector(cov)], -1)
+        out_head = self.head(features)
+        action = out_head[0] if isinstance(out_head, tuple) else out_head
+        if self.action_low is not None and self.action_high is not None:
+            action = torch.clamp(action, self.action_low, self.action_high)
+        return action, filtered, age + 1
+
+    def _update(
+        self,
+        observation: Tensor,
+        observed: Tensor,
+        previous_action: Tensor,
+        reset: Tensor,
+        mean: Tensor,
+    ) -> Tensor:
+        """Return the filtered mean of a constant-Q model; reset has shape (batch, 1)."""
+        model = self._model()
+        m = torch.where(reset, model.initial_mean, model.transition(mean, previous_action))
+        expected = nn.functional.linear(
+            torch.cat([m, previous_action], -1), self.get_buffer("expectation"),
+            model.emission_offset,
+        )  # fmt: skip
+        residual = zero_missing(observation - expected, observed)
+        row = reset.unsqueeze(-1)
+        # cholesky_ex: its plain form looks at a value on the host to raise.
+        if self.form == "innovation":
+            both = observed.unsqueeze(-1) & observed.unsqueeze(-2)
+            S = torch.where(
+                row, self.get_buffer("initial_innovation_cov"), self.get_buffer("innovation_cov")
+            )
+            A = torch.where(both, S, self.get_buffer("eye"))
+            factor, _ = torch.linalg.cholesky_ex(A)
+            z = torch.cholesky_solve(residual.unsqueeze(-1), factor).squeeze(-1)
+            pull = torch.where(
+                reset, z @ self.get_buffer("initial_cross"), z @ self.get_buffer("cross")
+            )
+            return m + pull
+        weight = observed * self.get_buffer("inverse_noise")
+        state = m.shape[-1]
+        gathered = (weight @ self.get_buffer("outer")).view(-1, state, state)
+        prior = torch.where(row, self.get_buffer("initial_precision"), self.get_buffer("precision"))
+        factor, _ = torch.linalg.cholesky_ex(gathered + prior)
+        evidence = (weight * residual) @ self.get_buffer("matrix")
+        return m + torch.cholesky_solve(evidence.unsqueeze(-1), factor).squeeze(-1).to(m.dtype)
