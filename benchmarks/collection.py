@@ -111,7 +111,7 @@ def main() -> None:
         BARE: Bare(env_id, num_envs, steps),
         "GymnasiumBatchEnv": BareBatch(env_id, num_envs, steps),
     } | {name: collector.rollout for name, collector in collectors.items()}
-    times = interleave(candidates, rounds=rounds, warmup=1)
+    times = interleave(candidates, rounds=rounds, warmup=1, clock=CLOCKS[args.clock])
     shares = {name: 1 / times.ratio(name, BARE) for name in times.seconds}
     rows = [
         (

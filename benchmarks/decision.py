@@ -90,7 +90,10 @@ def main() -> None:
                 action = out.get("action") if name == POLICY else out[0]
                 torch.testing.assert_close(action, expected, rtol=1e-4, atol=1e-5)
             times = interleave(
-                candidates, rounds=rounds, sample_seconds=0.0 if args.quick else 0.03
+                candidates,
+                rounds=rounds,
+                sample_seconds=0.0 if args.quick else 0.03,
+                clock=CLOCKS[args.clock],
             )
             microseconds = {name: 1e6 * times.median(name) for name in times.seconds}
             table(

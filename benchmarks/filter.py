@@ -181,7 +181,9 @@ def main() -> None:
             ("TensorDict", module_candidates, "GRUModule pad"),
         )
         for level, make, base in levels:
-            times = interleave(make(data, state), rounds=rounds, sample_seconds=sample)
+            times = interleave(
+                make(data, state), rounds=rounds, sample_seconds=sample, clock=CLOCKS[args.clock]
+            )
             report(f"{title}, {level}", times, base)
             row[level] = {name: times.median(name) for name in times.seconds}
             ours = next(iter(times.seconds))

@@ -103,6 +103,7 @@ def main() -> None:
         {name: Pass(**sizes) for name, sizes in points.items()},
         rounds=rounds,
         sample_seconds=0.0 if args.quick else 0.02,
+        clock=CLOCKS[args.clock],
     )
     results = {}
     for name, values in varied.items():

@@ -216,7 +216,7 @@ def main() -> None:
             candidates[name] = stable_baselines(env_id, size, recurrent)
     candidates[TORCHRL] = TorchRLRecipe(env_id, size)
     torch.set_num_threads(args.threads)  # whatever a peer set at its construction
-    times = interleave(candidates, rounds=rounds, warmup=1)
+    times = interleave(candidates, rounds=rounds, warmup=1, clock=CLOCKS[args.clock])
     speed = {name: size.frames / times.median(name) for name in times.seconds}
     ratios = {(a, b): times.ratio(b, a) for a in times.seconds for b in times.seconds}
     base = SB3 if SB3 in speed else DEFAULTS

@@ -34,6 +34,7 @@ _PACKAGES = (
     "tensordict",
     "gymnasium",
     "mujoco",
+    "envpool",
     "numpy",
     "torchrl-drbpn",
     "stable-baselines3",

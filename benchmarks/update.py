@@ -9,7 +9,7 @@ features, the backward pass through the filter, gradient norm and optimiser.
 from __future__ import annotations
 
 import statistics
-import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -36,8 +36,10 @@ PARTS = (
 class Update:
     """One gradient step, with a clock at the borders of its parts."""
 
-    def __init__(self, training: Training, batch: TensorDictBase, max_norm: float) -> None:
-        self.training, self.batch, self.max_norm = training, batch, max_norm
+    def __init__(
+        self, training: Training, batch: TensorDictBase, max_norm: float, clock: Callable[[], float]
+    ) -> None:
+        self.training, self.batch, self.max_norm, self.clock = training, batch, max_norm, clock
         self.parameters = list(training.agent.parameters())
         self.rows: list[dict[str, float]] = []
         self._in_filter = 0.0
@@ -46,33 +48,33 @@ class Update:
         training.agent.belief.register_forward_hook(self._leave)
 
     def _enter(self, *_: Any) -> None:
-        self._entered = time.perf_counter()
+        self._entered = self.clock()
 
     def _leave(self, _module: Any, _inputs: Any, out: Any) -> None:
-        self._in_filter += time.perf_counter() - self._entered
+        self._in_filter += self.clock() - self._entered
         features = out.get("features")
         if features.ndim == 3 and features.requires_grad:
             # The engine computes this gradient when it has passed loss and heads.
             features.register_hook(self._mark)
 
     def _mark(self, _grad: torch.Tensor) -> None:
-        self._features_done = time.perf_counter()
+        self._features_done = self.clock()
 
     def __call__(self) -> None:
         """Take the step and note its times."""
         loss, optimizer = self.training.loss, self.training.optimizer
         self._in_filter, self._features_done = 0.0, None
-        begin = time.perf_counter()
+        begin = self.clock()
         out = loss(self.batch)
         total = sum(value for key, value in out.items() if key.startswith("loss"))
         assert isinstance(total, torch.Tensor)
-        forward = time.perf_counter()
+        forward = self.clock()
         optimizer.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
-        backward = time.perf_counter()
+        backward = self.clock()
         torch.nn.utils.clip_grad_norm_(self.parameters, self.max_norm)
         optimizer.step()
-        end = time.perf_counter()
+        end = self.clock()
         middle = backward if self._features_done is None else self._features_done
         values = (
             self._in_filter,
@@ -112,12 +114,12 @@ def main() -> None:
         add_advantages(data, training.agent, training.gae)
         sequences = to_sequences(data, training.loss, settings.optim.sequence_length)
         batch = next(minibatches(sequences, settings.optim.minibatches, training.generator))
-        updates[name] = Update(training, batch, settings.optim.max_grad_norm)
+        updates[name] = Update(training, batch, settings.optim.max_grad_norm, CLOCKS[args.clock])
         titles[name] = (
             f"{name} ({batch.shape[0]} x {batch.shape[1]} = {batch.numel()} frames a minibatch)"
         )
         training.collector.shutdown()
-    times = interleave(updates, rounds=rounds, warmup=3)
+    times = interleave(updates, rounds=rounds, warmup=3, clock=CLOCKS[args.clock])
     results = {}
     for name, update in updates.items():
         total = 1e3 * times.median(name)

@@ -1,4 +1,4 @@
-"""The recipe's other belief modules: recurrent networks and last-value filling.
+"""The recipe's other belief modules: recurrent networks, a transformer, last-value filling.
 
 One step at a time equals whole sequences, episode starts inside them included; the auxiliary
 likelihood counts what arrived and nothing else; collected data give a probability ratio of 1.
@@ -14,7 +14,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_primers_from_module
 
 OBS, ACTION, TIME = 5, 2, 7
-RECURRENT = ["gru", "gru_action", "gru belief.cell=lstm"]
+RECURRENT = ["gru", "gru_action", "gru belief.cell=lstm", "transformer belief.window=4"]
 
 
 def make_belief(name: str):
@@ -49,7 +49,7 @@ def step_by_step(module, frames: TensorDict) -> TensorDict:
     for t in range(TIME):
         step = frames[:, t].clone()
         for key in primers.keys(True, True):
-            zero = torch.zeros(len(step), *primers[key].shape)
+            zero = torch.zeros(len(step), *primers[key].shape, dtype=primers[key].dtype)
             first = step["is_init"].reshape(-1, *[1] * primers[key].ndim)
             step.set(key, zero if carried is None else torch.where(first, zero, carried[key]))
         module(step)
@@ -86,9 +86,9 @@ def test_the_likelihood_is_that_of_the_entries_that_arrived():
     frames["observation"][:] = float("nan")
     frames["observed"][1, 2, 4] = True
     frames["observation"][1, 2, 4] = 0.7
-    value = module.one_step_ahead(torch.zeros(3, TIME, 64), frames)
+    value = module.foresight(torch.zeros(3, TIME, 64), frames)
     expected = torch.zeros(3, TIME)
-    ahead = module.foresight(torch.cat([torch.zeros(64), frames["previous_action"][1, 2]]))
+    ahead = module.foresight.mean(torch.cat([torch.zeros(64), frames["previous_action"][1, 2]]))
     density = torch.distributions.Normal(ahead[4], 1.0).log_prob(torch.tensor(0.7))
     expected[1, 2] = density.detach()
     assert torch.allclose(value, expected, atol=1e-5)
@@ -112,7 +112,9 @@ def test_a_wrong_cell_is_named():
         make_belief("gru belief.cell=rnn")
 
 
-@pytest.mark.parametrize("name", ["gru", "gru_action", "fill", "fill belief.with_mask=true"])
+@pytest.mark.parametrize(
+    "name", ["gru", "gru_action", "transformer", "fill", "fill belief.with_mask=true"]
+)
 def test_fresh_data_give_a_ratio_of_one(name):
     from assembly.rollout import add_advantages, to_sequences
     from assembly.settings import read_settings
@@ -130,3 +132,25 @@ def test_fresh_data_give_a_ratio_of_one(name):
     if name.startswith("fill"):
         # where nothing arrived the features still hold a value: the last one
         assert (data["features"][..., : data["observed"].shape[-1]] != 0).float().mean() > 0.9
+
+
+def test_the_transformer_forgets_what_lies_beyond_its_window():
+    module = make_belief("transformer belief.window=3").module
+    frames = make_frames(2)
+    frames["is_init"][:, 1:] = False
+    changed = frames.clone()
+    changed["observation"][:, 0] += 1.0
+    with set_recurrent_mode(True):
+        before, after = module(frames)["features"], module(changed)["features"]
+    assert not torch.allclose(before[:, :3], after[:, :3])
+    assert torch.allclose(before[:, 3:], after[:, 3:])
+
+
+def test_the_transformer_sees_nothing_of_the_episode_before():
+    module = make_belief("transformer belief.window=6").module
+    frames = make_frames(2)
+    changed = frames.clone()
+    changed["observation"][0, :3] += 1.0  # row 0 starts anew at step 3
+    with set_recurrent_mode(True):
+        before, after = module(frames)["features"], module(changed)["features"]
+    assert torch.allclose(before[0, 3:], after[0, 3:])

@@ -89,7 +89,7 @@ def test_a_missing_and_an_unknown_key_are_named() -> None:
         ("missingness.mechanism=all", "`missingness.mechanism` must be one of none, mcar"),
         ("noise.sigma=-1", "`noise.sigma` must be 0 or more"),
         ("env.version=v9", "`env.version` must be one of v4, v5, got 'v9'"),
-        ("env.backend=abacus", "`env.backend` must be one of gymnasium, got 'abacus'"),
+        ("env.backend=abacus", "`env.backend` must be one of gymnasium, envpool, got 'abacus'"),
         ("total_frames=0", "`total_frames` must be positive"),
         ("total_frames=1.5", "`total_frames` must be a whole number"),
         ("seed=-1", "`seed` must be 0 or more"),

@@ -30,12 +30,17 @@ from torchrl_drbpn import (
     RunningReturnScale,
     seed_env,
 )
-from torchrl_drbpn.envs import GymnasiumBatchEnv
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
 _MECHANISMS: dict[str, Literal["mcar", "mar", "nmar"]] = {
     "mcar": "mcar",
     "mar": "mar",
     "nmar": "nmar",
+}
+
+_BACKENDS: dict[str, type[EnvPoolBatchEnv] | type[GymnasiumBatchEnv]] = {
+    "gymnasium": GymnasiumBatchEnv,
+    "envpool": EnvPoolBatchEnv,
 }
 
 
@@ -119,11 +124,13 @@ def task_dims(env: EnvSettings) -> tuple[int, int]:
     return dims
 
 
-def _make_base(env: EnvSettings, num_envs: int, num_threads: int) -> GymnasiumBatchEnv:
+def _make_base(
+    env: EnvSettings, num_envs: int, num_threads: int
+) -> EnvPoolBatchEnv | GymnasiumBatchEnv:
     """Build the simulators; what can't be used is the user's to mend."""
     try:
-        return GymnasiumBatchEnv(env.env_id, num_envs, num_threads=num_threads)
-    except (ValueError, gymnasium.error.Error) as error:
+        return _BACKENDS[env.backend](env.env_id, num_envs, num_threads=num_threads)
+    except (ValueError, ModuleNotFoundError, gymnasium.error.Error) as error:
         raise UserError(" ".join(str(error).split())) from error
 
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 # Tasks that lie flat are looked at from above; the others from the side.
 _FROM_ABOVE = ("Reacher", "Swimmer")
 _SIDE, _ABOVE = -5.0, -90.0  # elevation of the camera, degrees
-_ROOM = 1.45  # distance of the camera in sizes of the robot at rest
+_FAR = 0.9999  # depth of what is not there, 1 at the far end of the scene
+_ROOM = 1.45  # distance of the camera in heights of what has to fit
 
 
 def render_poses(
@@ -45,8 +46,12 @@ def render_poses(
         os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed
     plain = _on_white(model)
     data = mujoco.MjData(plain)
-    size, middle = _size_at_rest(plain, data)
+    extent, middle = _extent_at_rest(plain, data)
     flat = task.split("-")[0] in _FROM_ABOVE
+    # What lies flat turns: its longest side has to fit in both directions.
+    across, upward = (extent.max(), extent.max()) if flat else (extent[0], extent[2])
+    size = max(float(upward), float(across) * height / width)
+    sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX in plain.tex_type
     try:
         from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
 
@@ -61,7 +66,10 @@ def render_poses(
             mujoco.mj_forward(plain, data)
             # Along with the robot, but not up and down with it: the ground stays where it is.
             camera.lookat[:] = (*_center(data)[:2], middle)
-            pictures.append(np.asarray(viewer.render("rgb_array")).copy())
+            picture = np.array(viewer.render("rgb_array"))
+            if not sky:
+                picture[np.asarray(viewer.render("depth_array")) >= _FAR] = 255
+            pictures.append(picture)
         viewer.close()
     except Exception as error:  # each OpenGL back end fails in its own way
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -74,15 +82,15 @@ def _center(data: Any) -> NDArray[np.float64]:
     return np.asarray(data.subtree_com[0]).copy()
 
 
-def _size_at_rest(model: Any, data: Any) -> tuple[float, float]:
-    """Return the largest extent of the robot in its initial pose, and half its height, metres."""
+def _extent_at_rest(model: Any, data: Any) -> tuple[NDArray[np.float64], float]:
+    """Return the extent (x, y, z) of the robot's initial pose and the middle of its height, m."""
     mujoco.mj_resetData(model, data)
     mujoco.mj_forward(model, data)
     moving = np.asarray(model.geom_bodyid) > 0
     radius = np.asarray(model.geom_rbound)[moving, None]
     low = (np.asarray(data.geom_xpos)[moving] - radius).min(0)
     high = (np.asarray(data.geom_xpos)[moving] + radius).max(0)
-    return float((high - low).max()), float((high + low)[2] / 2)
+    return high - low, float((high + low)[2] / 2)
 
 
 def _on_white(model: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -98,7 +98,9 @@ def record_episode(
         UserError: if the agent keeps no Gaussian belief, the task is not MuJoCo's, or the
             episode is over before ``start``.
     """
-    settings = trained.settings
+    # Poses are read from Gymnasium's simulators, whatever the agent was trained on.
+    task = replace(trained.settings.env, backend="gymnasium")
+    settings = replace(trained.settings, env=task)
     policy = TensorDictSequential(_observing_belief(trained), trained.agent.actor)
     env = make_evaluation_environment(
         settings, trained.belief, trained.agent, episodes=1, missingness=missingness

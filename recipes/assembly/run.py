@@ -63,6 +63,11 @@ def run(config: Mapping[str, Any], folder: Path) -> int:
     training = assemble(settings)
     if state is not None:
         restore(training, state, source)
+        if state["simulators"] is None:
+            say(
+                f"env.backend={settings.env.backend} can't save the state of "
+                f"{settings.env.env_id}: going on with new episodes"
+            )
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder, {**config, "resume": None})
     write_versions(folder)

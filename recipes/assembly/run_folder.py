@@ -19,7 +19,16 @@ from yaml import YAMLError
 
 from assembly.errors import UserError
 
-_PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy", "hydra-core")
+_PACKAGES = (
+    "torch",
+    "torchrl",
+    "tensordict",
+    "gymnasium",
+    "mujoco",
+    "envpool",
+    "numpy",
+    "hydra-core",
+)
 
 
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:

@@ -228,7 +228,7 @@ def _describe(hint: Any) -> str:
 def _check(s: Settings) -> None:
     """Reject values that make no sense, one line each."""
     choices = {
-        "env.backend": (s.env.backend, ("gymnasium",)),
+        "env.backend": (s.env.backend, ("gymnasium", "envpool")),
         "env.version": (s.env.version, ("v4", "v5")),
         "missingness.mechanism": (s.missingness.mechanism, ("none", "mcar", "mar", "nmar")),
         "loss.loss_critic_type": (s.loss.loss_critic_type, ("l1", "l2", "smooth_l1")),

@@ -258,15 +258,16 @@ def training_state(training: Training) -> dict[str, Any]:
     Returns:
         Tensors, numbers, texts, and containers of them.
     """
-    progress = training.progress
+    progress, keeps = training.progress, training.env.base_env.supports_state
     return {
         "agent": training.agent.state_dict(),
         "optimizer": training.optimizer.state_dict(),
         "transforms": training.env.state_dict(),
-        "simulators": training.env.base_env.state_dict(),
+        # None where the simulators keep their state to themselves: new episodes start then.
+        "simulators": training.env.base_env.state_dict() if keeps else None,
         # Collector has no public way to its carry-over (the root step from which the next rollout
         # goes on): its own state_dict leaves it out and starts new episodes.
-        "carrier": training.collector._carrier.to_dict(),
+        "carrier": training.collector._carrier.to_dict() if keeps else None,
         "torch_generator": torch.get_rng_state(),
         "minibatch_generator": training.generator.get_state(),
         "progress": {
@@ -294,14 +295,19 @@ def restore(training: Training, state: dict[str, Any], source: str) -> None:
         training.agent.load_state_dict(state["agent"])
         training.optimizer.load_state_dict(state["optimizer"])
         training.env.load_state_dict(state["transforms"])
-        training.env.base_env.load_state_dict(state["simulators"])
-        carrier = TensorDict.from_dict(state["carrier"], batch_size=training.env.batch_size)
-        training.collector._carrier = carrier
+        if state["simulators"] is not None:
+            training.env.base_env.load_state_dict(state["simulators"])
+            carrier = TensorDict.from_dict(state["carrier"], batch_size=training.env.batch_size)
+            training.collector._carrier = carrier
         training.generator.set_state(state["minibatch_generator"])
         kept = dict(state["progress"])
         kept["returns"] = deque(kept["returns"], maxlen=_RECENT_EPISODES)
         training.progress = Progress(**kept)
         torch.set_rng_state(state["torch_generator"])
+        if state["simulators"] is None:
+            # A seed of this point of the run: that of the run would repeat its first episodes.
+            training.env.base_env.set_seed(int(torch.randint(2**31, ())))
+            training.collector.reset()
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise UserError(

@@ -7,12 +7,12 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.modules import GRUModule, LSTMModule
 
 from assembly.beliefs import Belief
+from assembly.beliefs.foresight import Foresight
 from torchrl_drbpn import BeliefModelLoss
-from torchrl_drbpn.functional import inverse_softplus, positive_std, zero_missing
 
 _INPUT, _STATE, _STATE_C = "recurrent_input", "recurrent_state", "recurrent_state_c"
 
@@ -21,11 +21,9 @@ class RecurrentBelief(TensorDictModuleBase):
     r"""Run a recurrent network over (what arrived, which entries did[, previous action]).
 
     Its auxiliary task, the paper's for DR-PPO and ADR-PPO, is to foresee the next observation:
-    a head of the hidden state and the action gives a Gaussian, whose log-likelihood of the
-    entries that arrive is the model loss.
+    see :class:`~assembly.beliefs.foresight.Foresight`.
 
-    .. math:: h_t = \mathrm{RNN}(h_{t-1}, [x_t, m_t, a_{t-1}]), \qquad
-        \log N(x_t^{obs}; g(h_{t-1}, a_{t-1}), \mathrm{diag}(\sigma^2))
+    .. math:: h_t = \mathrm{RNN}(h_{t-1}, [x_t, m_t, a_{t-1}])
 
     Args:
         obs_dim: components of an observation.
@@ -56,7 +54,7 @@ class RecurrentBelief(TensorDictModuleBase):
             raise ValueError(f"`cell` must be 'gru' or 'lstm', got {cell!r}.")
         if hidden_size < 1:
             raise ValueError(f"`hidden_size` must be at least 1, got {hidden_size}.")
-        self.with_action, self.min_std = with_action, min_std
+        self.with_action = with_action
         width = 2 * obs_dim + (action_dim if with_action else 0)
         states = [_STATE] if cell == "gru" else [_STATE, _STATE_C]
         self.memory = (GRUModule if cell == "gru" else LSTMModule)(
@@ -65,13 +63,9 @@ class RecurrentBelief(TensorDictModuleBase):
             in_keys=[_INPUT, *states],
             out_keys=["features", *(("next", key) for key in states)],
         )
-        self.foresight = nn.Sequential(
-            nn.Linear(hidden_size + action_dim, hidden_size),
-            nn.Tanh(),
-            nn.Linear(hidden_size, obs_dim),
+        self.foresight = Foresight(
+            hidden_size, obs_dim, action_dim, init_std=init_std, min_std=min_std
         )
-        start = torch.full((obs_dim,), init_std - min_std)
-        self.raw_std = nn.Parameter(inverse_softplus(start))
         self.in_keys = ["observation", "observed", "previous_action", "is_init", *states]
         self.out_keys = ["features", ("belief", "log_likelihood"), *self.memory.out_keys[1:]]
 
@@ -100,25 +94,8 @@ class RecurrentBelief(TensorDictModuleBase):
         for key in self.memory.out_keys[1:]:
             tensordict.set(key, data.get(key))
         before = self._before(features, stored, is_init)
-        tensordict.set(("belief", "log_likelihood"), self.one_step_ahead(before, tensordict))
+        tensordict.set(("belief", "log_likelihood"), self.foresight(before, tensordict))
         return tensordict
-
-    def one_step_ahead(self, hidden: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Return the log-likelihood of what arrived, as foreseen from the step before.
-
-        Args:
-            hidden: hidden state before the step, shape ``(*, hidden)``.
-            tensordict: with ``observation``, ``observed`` and ``previous_action``.
-
-        Returns:
-            Shape ``(*,)``, nats; 0 where nothing arrived.
-        """
-        observed = tensordict.get("observed")
-        seen = zero_missing(tensordict.get("observation"), observed)
-        foreseen = self.foresight(torch.cat([hidden, tensordict.get("previous_action")], -1))
-        std = positive_std(self.raw_std, self.min_std)
-        density = torch.distributions.Normal(foreseen, std, validate_args=False).log_prob(seen)
-        return zero_missing(density, observed).sum(-1)
 
     def _before(self, features: Tensor, stored: Tensor | None, is_init: Tensor) -> Tensor:
         """Return the hidden state before each step; zero where an episode starts."""

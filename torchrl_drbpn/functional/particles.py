@@ -1,0 +1,450 @@
+"""A particle filter with a learned proposal: weights, resampling, one step, a whole sequence.
+
+The filter of deep variational reinforcement learning ([DVRL 2018]: Igl, Zintgraf, Le, Wood and
+Whiteson, *Deep Variational Reinforcement Learning for POMDPs*, ICML 2018). A particle is a
+deterministic memory h and a stochastic latent z. Everything is computed for all particles and all
+rows at once; the only loop is over time. Nothing here draws a random number: the noise of a step
+is an argument, so that the same noise gives the same particles again.
+
+Inside a docstring k counts particles, K is their number, q the proposal, p the model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional.gaussian import LOG_2PI, zero_missing
+
+__all__ = [
+    "DiagonalGaussian",
+    "Outcome",
+    "ParticleModel",
+    "ParticleNoise",
+    "ParticleOutput",
+    "Prospect",
+    "diagonal_log_density",
+    "effective_sample_size",
+    "log_mean_weight",
+    "particle_sequence",
+    "particle_step",
+    "resample",
+    "systematic_ancestors",
+]
+
+
+class DiagonalGaussian(NamedTuple):
+    """Hold N(mean, diag(variance)).
+
+    Args:
+        mean: shape ``(*batch, dim)``.
+        variance: shape ``(*batch, dim)`` or one that broadcasts to it, positive.
+
+    Example:
+        >>> import torch
+        >>> DiagonalGaussian(torch.zeros(3, 2), torch.ones(2)).mean.shape
+        torch.Size([3, 2])
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+
+class ParticleNoise(NamedTuple):
+    """Hold what is random in a step: given it, the filter is a function of its inputs.
+
+    Args:
+        proposal: standard normal, shape ``(*batch, [time,] particles, latent)``; z is the
+            proposal's mean plus this times its standard deviation.
+        resampling: uniform on [0, 1), shape ``(*batch, [time,] 1)``; where systematic resampling
+            begins.
+
+    Example:
+        >>> import torch
+        >>> noise = ParticleNoise.sample((4,), 10, 3, torch.Generator().manual_seed(0))
+        >>> noise.proposal.shape, noise.resampling.shape
+        (torch.Size([4, 10, 3]), torch.Size([4, 1]))
+    """
+
+    proposal: Tensor
+    resampling: Tensor
+
+    @classmethod
+    def sample(
+        cls,
+        shape: Sequence[int],
+        particles: int,
+        latent: int,
+        generator: torch.Generator,
+        dtype: torch.dtype | None = None,
+    ) -> ParticleNoise:
+        """Draw the noise of independent steps.
+
+        Args:
+            shape: ``(*batch, [time])``.
+            particles: K.
+            latent: components of z.
+            generator: every number comes from it; its device is that of the result.
+            dtype: of the result.
+
+        Returns:
+            The noise.
+        """
+        given: dict[str, Any] = {
+            "generator": generator,
+            "dtype": dtype,
+            "device": generator.device,
+        }
+        proposal = torch.randn(*shape, particles, latent, **given)
+        return cls(proposal, torch.rand(*shape, 1, **given))
+
+
+class Prospect(NamedTuple):
+    """Hold what the particles expect of z before it is drawn.
+
+    Args:
+        proposal: q(z | h, x, a), each ``(*batch, particles, latent)``.
+        transition: p(z | h, a), the same shapes.
+        context: anything else of the model that its ``outcome`` wants back.
+
+    Example:
+        >>> import torch
+        >>> gaussian = DiagonalGaussian(torch.zeros(10, 3), torch.ones(10, 3))
+        >>> Prospect(gaussian, gaussian).context is None
+        True
+    """
+
+    proposal: DiagonalGaussian
+    transition: DiagonalGaussian
+    context: Any = None
+
+
+class Outcome(NamedTuple):
+    """Hold what follows from a z.
+
+    Args:
+        emission: p(x | h, z, a), each ``(*batch, particles, obs)``.
+        hidden: the next h, shape ``(*batch, particles, hidden)``.
+        embedding: what else of a particle is handed on beside h, such as features of z, shape
+            ``(*batch, particles, embedding)``.
+
+    Example:
+        >>> import torch
+        >>> emission = DiagonalGaussian(torch.zeros(10, 5), torch.ones(10, 5))
+        >>> Outcome(emission, torch.zeros(10, 4), torch.zeros(10, 3)).hidden.shape
+        torch.Size([10, 4])
+    """
+
+    emission: DiagonalGaussian
+    hidden: Tensor
+    embedding: Tensor
+
+
+class ParticleModel(Protocol):
+    """State what a model has to offer: two functions of all particles of all rows at once.
+
+    ``inputs`` is a tuple of tensors with a leading ``(*batch,)``: whatever the model makes of the
+    step's observation, mask and action, the same for every particle of a row.
+    """
+
+    def prospect(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> Prospect:
+        """Return q(z | h, x, a) and p(z | h, a)."""
+
+    def outcome(
+        self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
+    ) -> Outcome:
+        """Return p(x | h, z, a) and the next h."""
+
+
+class ParticleOutput(NamedTuple):
+    """Hold the particles after a step, or after every step of a sequence.
+
+    Args:
+        hidden: h, shape ``(*batch, [time,] particles, hidden)``.
+        log_weight: unnormalised, of this step alone, shape ``(*batch, [time,] particles)``, nats.
+        log_likelihood: log of the mean weight, shape ``(*batch, [time])``, nats.
+        embedding: shape ``(*batch, [time,] particles, embedding)``.
+        latent: z, shape ``(*batch, [time,] particles, latent)``.
+        expected: mean of the emission, shape ``(*batch, [time,] particles, obs)``.
+
+    Example:
+        >>> ParticleOutput._fields[:3]
+        ('hidden', 'log_weight', 'log_likelihood')
+    """
+
+    hidden: Tensor
+    log_weight: Tensor
+    log_likelihood: Tensor
+    embedding: Tensor
+    latent: Tensor
+    expected: Tensor
+
+
+# --------------------------------------------------------------------------------- densities, weights
+def diagonal_log_density(
+    value: Tensor, gaussian: DiagonalGaussian, observed: Tensor | None = None
+) -> Tensor:
+    r"""Evaluate log N(value; mean, diag(variance)) on the observed entries.
+
+    .. math:: \log p = -\tfrac12 \sum_{i: m_i}
+        \left( (x_i - \mu_i)^2 / v_i + \log v_i + \log 2\pi \right)
+
+    With nothing observed the value is exactly 0.
+
+    Args:
+        value: x, shape ``(*batch, dim)``; what stands at missing entries is ignored.
+        gaussian: mean and variance, shapes that broadcast with ``(*batch, dim)``.
+        observed: bool m, True = arrived, broadcasts with ``(*batch, dim)``; None: all of them.
+
+    Returns:
+        Shape ``(*batch,)``, nats.
+
+    Example:
+        >>> import torch
+        >>> gaussian = DiagonalGaussian(torch.zeros(2), torch.ones(2))
+        >>> x = torch.tensor([1.0, float("nan")])
+        >>> seen = torch.tensor([True, False])
+        >>> one = torch.distributions.Normal(0.0, 1.0).log_prob(torch.tensor(1.0))
+        >>> bool(torch.isclose(diagonal_log_density(x, gaussian, seen), one))
+        True
+    """
+    mean, variance = gaussian
+    if observed is None:
+        terms = (value - mean).square() / variance + variance.log() + LOG_2PI
+        return -0.5 * terms.sum(-1)
+    # Zero first, subtract after: a NaN under a False mask must reach neither value nor gradient.
+    value = zero_missing(value, observed)
+    terms = (value - mean).square() / variance + variance.log() + LOG_2PI
+    return -0.5 * zero_missing(terms, observed).sum(-1)
+
+
+def log_mean_weight(log_weight: Tensor) -> Tensor:
+    r"""Estimate the likelihood of a step: the log of the particles' mean weight.
+
+    .. math:: \log \hat p(x_t \mid x_{<t}) = \log \frac1K \sum_k w_t^k
+
+    §3.2 [DVRL 2018]: its sum over time is a lower bound of the marginal log-likelihood, in
+    expectation, and the product of the mean weights is unbiased for the marginal likelihood.
+
+    Args:
+        log_weight: shape ``(*batch, particles)``, nats.
+
+    Returns:
+        Shape ``(*batch,)``, nats.
+
+    Example:
+        >>> import torch
+        >>> log_mean_weight(torch.tensor([2.0, 4.0]).log()).exp().item()
+        3.0
+    """
+    return log_weight.logsumexp(-1) - math.log(log_weight.shape[-1])
+
+
+def effective_sample_size(log_weight: Tensor) -> Tensor:
+    r"""Tell how many equally weighted particles these are worth.
+
+    .. math:: \mathrm{ESS} = 1 / \sum_k \bar w_k^2
+
+    Args:
+        log_weight: shape ``(*batch, particles)``, nats; need not be normalised.
+
+    Returns:
+        Shape ``(*batch,)``, between 1 and the number of particles.
+
+    Example:
+        >>> import torch
+        >>> round(effective_sample_size(torch.zeros(8)).item(), 4)
+        8.0
+    """
+    return 1.0 / log_weight.softmax(-1).square().sum(-1)
+
+
+# ----------------------------------------------------------------------------------------- resampling
+@torch.no_grad()
+def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
+    r"""Choose the particles that go on, by systematic resampling.
+
+    .. math:: a_k = \min \{ j : \sum_{i \le j} \bar w_i > (k + u) / K \}, \qquad k = 0..K-1
+
+    Particle j has K w_j offspring in expectation and never one more or less than that, rounded;
+    equal weights keep every particle. No gradient flows through the choice, as in the original.
+
+    Args:
+        log_weight: shape ``(*batch, particles)``, nats; need not be normalised.
+        uniform: u, on [0, 1), shape ``(*batch, 1)``.
+
+    Returns:
+        Ancestors, int64, shape ``(*batch, particles)``, ascending.
+
+    Example:
+        >>> import torch
+        >>> log_weight = torch.tensor([0.5, 0.0, 0.25, 0.25]).log()
+        >>> systematic_ancestors(log_weight, torch.tensor([0.5])).tolist()
+        [0, 0, 2, 3]
+    """
+    count = log_weight.shape[-1]
+    total = log_weight.softmax(-1).cumsum(-1)
+    total = total / total[..., -1:]  # rounding leaves the last sum a little off 1
+    place = torch.arange(count, dtype=uniform.dtype, device=uniform.device)
+    position = ((place + uniform) / count).to(total.dtype)
+    return torch.searchsorted(total, position, right=True).clamp_max(count - 1)
+
+
+def resample(values: Tensor, ancestors: Tensor) -> Tensor:
+    """Let each particle take over what its ancestor holds.
+
+    Args:
+        values: shape ``(*batch, particles, dim)``.
+        ancestors: int64, shape ``(*batch, particles)``.
+
+    Returns:
+        Shape of ``values``; its gradient goes to the ancestors.
+
+    Example:
+        >>> import torch
+        >>> resample(torch.tensor([[1.0], [2.0], [3.0]]), torch.tensor([0, 0, 2])).tolist()
+        [[1.0], [1.0], [3.0]]
+    """
+    return values.gather(-2, ancestors.unsqueeze(-1).expand_as(values))
+
+
+# ------------------------------------------------------------------------------ one step, one sequence
+def particle_step(
+    model: ParticleModel,
+    hidden: Tensor,
+    log_weight: Tensor,
+    inputs: tuple[Tensor, ...],
+    observation: Tensor,
+    observed: Tensor,
+    noise: ParticleNoise,
+) -> ParticleOutput:
+    r"""Resample, propose, weigh: one step of every particle of every row.
+
+    .. math::
+        h' = h^{a_k}, \quad a \sim w_{t-1}; \qquad z \sim q(z \mid h', x_t, a_{t-1}); \qquad
+        \log w_t = \log p(z \mid h', a_{t-1}) - \log q(z \mid h', x_t, a_{t-1})
+        + \log p(x_t^{obs} \mid h', z, a_{t-1})
+
+    Algorithm 1 [DVRL 2018]; differs from it in the last term, which counts the entries that
+    arrived. With nothing observed the weight is p / q alone.
+
+    Args:
+        model: the distributions.
+        hidden: h of the step before, shape ``(*batch, particles, hidden)``.
+        log_weight: of the step before, shape ``(*batch, particles)``, nats; zeros at a start.
+        inputs: of this step, for the model.
+        observation: shape ``(*batch, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, obs)``.
+        noise: of this step.
+
+    Returns:
+        The particles after the step.
+
+    Example:
+        >>> import torch
+        >>> class Walk:  # z = h + noise, seen with noise; proposed from the transition itself
+        ...     def prospect(self, hidden, inputs):
+        ...         moved = DiagonalGaussian(hidden, torch.ones_like(hidden))
+        ...         return Prospect(moved, moved)
+        ...     def outcome(self, latent, hidden, context, inputs):
+        ...         seen = DiagonalGaussian(latent, torch.ones_like(latent))
+        ...         return Outcome(seen, latent, latent)
+        >>> noise = ParticleNoise.sample((2,), 8, 3, torch.Generator().manual_seed(0))
+        >>> nothing = torch.zeros(2, 3, dtype=torch.bool)
+        >>> out = particle_step(
+        ...     Walk(), torch.zeros(2, 8, 3), torch.zeros(2, 8), (), torch.zeros(2, 3), nothing,
+        ...     noise)
+        >>> bool((out.log_likelihood.abs() < 1e-6).all())  # q = p and nothing seen: weight 1
+        True
+    """
+    hidden = resample(hidden, systematic_ancestors(log_weight, noise.resampling))
+    proposal, transition, context = model.prospect(hidden, inputs)
+    latent = proposal.mean + proposal.variance.sqrt() * noise.proposal
+    outcome = model.outcome(latent, hidden, context, inputs)
+    # log p - log q: the constants cancel, and (z - mean_q)^2 / variance_q is the noise squared.
+    surprise = (latent - transition.mean).square() / transition.variance
+    ratio = noise.proposal.square() - surprise + (proposal.variance / transition.variance).log()
+    seen = diagonal_log_density(
+        observation.unsqueeze(-2), outcome.emission, observed.unsqueeze(-2)
+    )
+    log_weight = 0.5 * ratio.sum(-1) + seen
+    return ParticleOutput(
+        outcome.hidden,
+        log_weight,
+        log_mean_weight(log_weight),
+        outcome.embedding,
+        latent,
+        outcome.emission.mean,
+    )
+
+
+def particle_sequence(
+    model: ParticleModel,
+    hidden: Tensor,
+    log_weight: Tensor,
+    begin: Tensor,
+    inputs: tuple[Tensor, ...],
+    observation: Tensor,
+    observed: Tensor,
+    noise: ParticleNoise,
+) -> ParticleOutput:
+    """Run :func:`particle_step` over time, one iteration a step.
+
+    Args:
+        model: the distributions.
+        hidden: h of the step before each step, shape ``(*batch, time, particles, hidden)``; read
+            at the first step and where ``begin`` says so. Zeros are an episode's start.
+        log_weight: the same of the weights, shape ``(*batch, time, particles)``, nats.
+        begin: bool, shape ``(*batch, time)``: take the state given for this step, not that of
+            the step before.
+        inputs: for the model, each with a leading ``(*batch, time)``.
+        observation: shape ``(*batch, time, obs)``.
+        observed: bool, shape ``(*batch, time, obs)``.
+        noise: with a leading ``(*batch, time)``.
+
+    Returns:
+        The particles after every step.
+
+    Example:
+        >>> import torch
+        >>> class Walk:
+        ...     def prospect(self, hidden, inputs):
+        ...         moved = DiagonalGaussian(hidden, torch.ones_like(hidden))
+        ...         return Prospect(moved, moved)
+        ...     def outcome(self, latent, hidden, context, inputs):
+        ...         seen = DiagonalGaussian(latent, torch.ones_like(latent))
+        ...         return Outcome(seen, latent, latent)
+        >>> noise = ParticleNoise.sample((2, 5), 8, 3, torch.Generator().manual_seed(0))
+        >>> x, m = torch.randn(2, 5, 3), torch.ones(2, 5, 3, dtype=torch.bool)
+        >>> out = particle_sequence(
+        ...     Walk(), torch.zeros(2, 5, 8, 3), torch.zeros(2, 5, 8),
+        ...     torch.zeros(2, 5, dtype=torch.bool), (), x, m, noise)
+        >>> out.hidden.shape, out.log_likelihood.shape
+        (torch.Size([2, 5, 8, 3]), torch.Size([2, 5]))
+    """
+    dim = observation.ndim - 2  # time
+    steps = zip(
+        hidden.unbind(dim),
+        log_weight.unbind(dim),
+        begin.unsqueeze(-1).unbind(dim),
+        zip(*(part.unbind(dim) for part in inputs), strict=True)
+        if inputs
+        else [()] * observation.shape[dim],
+        observation.unbind(dim),
+        observed.unbind(dim),
+        noise.proposal.unbind(dim),
+        noise.resampling.unbind(dim),
+        strict=True,
+    )
+    outs: list[ParticleOutput] = []
+    for given, weight, begins, step_inputs, x, m, proposal, resampling in steps:
+        if outs:
+            given = torch.where(begins.unsqueeze(-1), given, outs[-1].hidden)
+            weight = torch.where(begins, weight, outs[-1].log_weight)
+        step_noise = ParticleNoise(proposal, resampling)
+        outs.append(particle_step(model, given, weight, step_inputs, x, m, step_noise))
+    return ParticleOutput(*(torch.stack(parts, dim) for parts in zip(*outs, strict=True)))
