@@ -19,15 +19,10 @@ from assembly.belief_figure import save_figure
 from assembly.console import run_or_explain, say
 from assembly.errors import UserError
 from assembly.run_folder import write_table, write_whole
-from assembly.study import (
-    evaluation_rows,
-    find_folders,
-    read_study,
-    summary_rows,
-    training_rows,
-)
+from assembly.study import find_folders, read_study
 from assembly.study_figures import learning_curves, robustness
 from assembly.study_page import csv_cells, study_page
+from assembly.study_tables import evaluation_rows, summary_rows, training_rows
 from omegaconf import DictConfig, OmegaConf
 
 # In this order: the page, which names the others, comes last.

@@ -316,6 +316,12 @@ def test_it_survives_a_file_a_copy_and_a_cast():
         ({"state_dim": 0}, "`state_dim` must be an int of at least 1, got 0"),
         ({"obs_dim": 0}, "must be an int of at least 1, got 0"),
         ({"action_dim": 0}, "`action_dim` must be an int of at least 1, got 0"),
+        ({"obs_dim": 0, "state_dim": None}, "`obs_dim` must be an int of at least 1, got 0"),
+        ({"form": "fast"}, "`form` must be 'auto', .* got 'fast'"),
+        (
+            {"form": "information", "emission": LinearGaussianEmission(5, 3, ACTION, cov="full")},
+            "`form` 'information' needs a diagonal emission covariance",
+        ),
         ({"initial_cov": "scalar"}, "`initial_cov` must be one of diag, full, got 'scalar'"),
         ({"initial_std": 0.0}, "`initial_std` must be above its floor"),
         (
@@ -337,9 +343,11 @@ def test_a_filter_that_cannot_be_is_refused(kwargs, message):
         BeliefFilter(**{"obs_dim": OBS, "action_dim": ACTION, "state_dim": 3, **kwargs})
 
 
-def test_an_unknown_form_is_refused():
+def test_a_form_set_later_is_checked_when_it_is_used():
+    filter = BeliefFilter(OBS, ACTION, 3, dtype=F64)
+    filter.form = "fast"
     with pytest.raises(ValueError, match=r"`form`.*'fast'"):
-        BeliefFilter(OBS, ACTION, 3, form="fast", dtype=F64)(*make_inputs(3))
+        filter(*make_inputs(3))
 
 
 BAD = {

@@ -321,6 +321,12 @@ def test_the_fast_forms_refuse_vmap_over_sequences():
         ({"out_keys": ["belief_mean"]}, "`out_keys` names"),
         ({"out_keys": {"feature": "a"}}, "`out_keys` names"),
         ({"policy_input": "cov"}, "`policy_input` must be 'mean' or 'mean_cov', got 'cov'"),
+        ({"in_keys": ["x", "x", "a", "i"]}, "`in_keys` must give .* of its own, got x twice"),
+        (
+            {"out_keys": {"features": "x", ("belief", "mean"): "x"}},
+            "`out_keys` must give .* x twice",
+        ),
+        ({"out_keys": ["features", ("next", "rnn", "mean")]}, "`out_keys` names .*'rnn'.* in_keys"),
     ],
 )
 def test_a_wrong_key_or_choice_is_refused(kwargs, message):
@@ -341,6 +347,17 @@ def test_an_absent_entry_is_named_with_its_remedy(absent, remedy):
     module = BeliefFilterModule(make_filter(dtype=torch.float64))
     with pytest.raises(KeyError, match=f"`{absent}` is not in the tensordict.*{remedy}"):
         module(make_frames((3,)).exclude(absent))
+
+
+@pytest.mark.parametrize("name", ["in_keys", "out_keys"])
+def test_one_string_is_no_list_of_keys(name):
+    with pytest.raises(TypeError, match=f"`{name}` must be a list of keys or a dict, got 'feat"):
+        BeliefFilterModule(make_filter(), **{name: "features"})
+
+
+def test_a_nested_key_may_come_as_a_list_as_configurations_write_it():
+    module = BeliefFilterModule(make_filter(), out_keys=["features", ["belief", "cov"]])
+    assert module.out_keys[:2] == ["features", ("belief", "cov")]
 
 
 def test_a_sequence_without_a_batch_dimension_is_refused():

@@ -85,14 +85,19 @@ def test_a_missing_and_an_unknown_key_are_named() -> None:
     [
         ("missingness.eta=1.5", r"`missingness.eta` must lie in \[0, 1\], got 1.5"),
         ("missingness.eta=-0.1", r"`missingness.eta` must lie in \[0, 1\]"),
-        ("missingness.eta=much", "`missingness.eta` must be a number, got 'much'"),
+        ("missingness.eta=much", "`missingness.eta` must be a finite number, got 'much'"),
+        ("missingness.eta=nan", r"`missingness.eta` must lie in \[0, 1\], got nan"),
+        ("optim.lr=inf", "`optim.lr` must be a finite number, got inf"),
         ("missingness.mechanism=all", "`missingness.mechanism` must be one of none, mcar"),
         ("noise.sigma=-1", "`noise.sigma` must be 0 or more"),
         ("env.version=v9", "`env.version` must be one of v4, v5, got 'v9'"),
         ("env.backend=abacus", "`env.backend` must be one of gymnasium, envpool, got 'abacus'"),
         ("total_frames=0", "`total_frames` must be positive"),
         ("total_frames=1.5", "`total_frames` must be a whole number"),
+        ("total_frames=inf", "`total_frames` must be a whole number, got inf"),
+        ("total_frames=nan", "`total_frames` must be a whole number, got nan"),
         ("seed=-1", "`seed` must be 0 or more"),
+        ("seed=9223372036854775808", r"`seed` must be under 2\*\*63"),
         ("optim.sequence_length=48", "`optim.sequence_length` must divide"),
         ("optim.minibatches=7", "`optim.minibatches` must divide the 128 sequences"),
         ("evaluation.modes=[best]", "`modes` must hold sampled and mean, got 'best'"),
@@ -158,3 +163,10 @@ def test_resume_refuses_other_overrides(tmp_path: Path, word: str) -> None:
     write_config(tmp_path, config())
     with pytest.raises(UserError, match=f"only total_frames, logger, evaluation .*{word}"):
         resumed_config(config(word), ["resume=x", word], tmp_path)
+
+
+def test_resume_refuses_a_second_run_folder(tmp_path: Path) -> None:
+    write_config(tmp_path, config())
+    word = "hydra.run.dir=elsewhere"
+    with pytest.raises(UserError, match=f"`resume` names the run folder already; .*{word}"):
+        resumed_config(config(), ["resume=x", word], tmp_path)

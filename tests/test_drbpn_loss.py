@@ -363,6 +363,19 @@ def test_a_rollout_without_an_end_adds_nothing():
     torch.testing.assert_close(out["loss_model"], -beliefs["belief", "log_likelihood"])
 
 
+def test_a_belief_module_that_takes_no_empty_batch_is_not_given_one():
+    class Strict(BeliefFilterModule):
+        def forward(self, tensordict):
+            assert tensordict.numel()
+            return super().forward(tensordict)
+
+    belief = Strict(make_filter(OBS, ACTION, torch.float64))
+    data = make_data()[:, :1].exclude("final")
+    data["next", "done"].fill_(False)
+    out = make_loss(make_agent(belief, belief.feature_dim, dtype=torch.float64))(data)
+    assert torch.isfinite(out["loss_model"])
+
+
 def test_nothing_observed_at_all_is_a_finite_zero():
     agent, data = make_belief_agent(), make_data()
     for key in ("observed", ("next", "observed")):

@@ -97,7 +97,7 @@ def test_truth_and_arrivals_differ_by_the_sensor_noise_alone(folder: Path) -> No
 
     noise = differences(record(folder))
     assert 0 < np.abs(noise).max() < 1.0
-    # The truth is the simulator's: in one running standard deviation a unit for all steps.
+    # The truth is the simulator's, shifted and scaled by the same numbers at every step.
     recording = record(folder)
     positions = np.array([np.concatenate(pose) for pose in recording.poses])
     slope = np.diff(recording.complete, axis=0) / np.diff(positions, axis=0)

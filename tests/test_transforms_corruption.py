@@ -219,6 +219,12 @@ def test_two_observations_need_two_masks():
         ObservationMissingness("mcar", 0.5, in_keys=[3])
 
 
+def test_a_nested_key_may_come_as_a_list_as_configurations_write_it():
+    missing = ObservationMissingness("mcar", 0.5, in_keys=[["agents", "observation"]])
+    assert missing.in_keys == [("agents", "observation")]
+    assert missing.mask_keys == [("agents", "observed")]
+
+
 def test_an_observation_that_the_environment_lacks_is_named():
     env = TransformedEnv(StaircaseEnv(), ObservationMissingness("mcar", 0.5, in_keys="state"))
     with pytest.raises(KeyError, match=r"reads 'state', which is not among .*'observation'"):
@@ -355,7 +361,7 @@ def test_unknown_mechanisms_and_shares_are_refused():
         ObservationMissingness("mar", 0.5, always_observed=2)
 
 
-@pytest.mark.parametrize("std", [-1.0, math.nan, math.inf, [0.1, -0.1], [[0.1]]])
+@pytest.mark.parametrize("std", [-1.0, math.nan, math.inf, [0.1, -0.1], [[0.1]], "much", None])
 def test_a_standard_deviation_is_finite_and_not_negative(std):
     with pytest.raises(ValueError, match="`noise_std` must be a number or one number"):
         ObservationNoise(std)

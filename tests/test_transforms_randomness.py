@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import math
 
+import numpy as np
 import pytest
 import torch
 from contracts import (
@@ -317,3 +318,9 @@ def test_a_seed_is_an_integer_and_not_negative(seed, error):
         ObservationNoise(0.1, seed=seed)
     with pytest.raises(error, match="`mechanism_seed` must"):
         ObservationMissingness("mar", 0.1, mechanism_seed=seed)
+
+
+def test_numbers_of_numpy_are_numbers():
+    missing = ObservationMissingness("mcar", np.float32(0.5), seed=np.int64(3))
+    assert (missing.eta, missing.seed) == (0.5, 3)
+    assert seed_env(staircase(missing), np.int64(4)) is not None

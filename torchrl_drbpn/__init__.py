@@ -9,6 +9,8 @@ from torchrl_drbpn.modules import (
     BeliefFilterModule,
     GaussianTransition,
     LinearGaussianEmission,
+    ParticleFilter,
+    ParticleFilterModule,
     PolicyStep,
 )
 from torchrl_drbpn.objectives import BeliefModelLoss, DRBPNLoss
@@ -43,6 +45,8 @@ __all__ = [
     "ObservationMissingness",
     "ObservationNoise",
     "ObservedFromNaN",
+    "ParticleFilter",
+    "ParticleFilterModule",
     "PolicyStep",
     "PreviousAction",
     "RunningReturnScale",

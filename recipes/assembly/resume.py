@@ -36,6 +36,8 @@ def resumed_config(
     for word in overrides:
         name = word.split("=", 1)[0].lstrip("+~")
         group = name.split(".", 1)[0]
+        if name == "hydra.run.dir":
+            raise UserError(f"`resume` names the run folder already; leave out {word!r}.")
         if group in ("resume", "hydra"):
             continue
         if group not in _MAY_CHANGE:

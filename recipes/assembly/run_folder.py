@@ -71,7 +71,8 @@ def write_versions(folder: Path) -> None:
     Args:
         folder: the run folder.
     """
-    versions = {"python": platform.python_version(), "platform": platform.platform()}
+    system = f"{platform.system()} {platform.machine()}"
+    versions = {"python": platform.python_version(), "platform": system}
     for name in (*_PACKAGES, "torchrl_drbpn"):
         try:
             versions[name] = version(name)

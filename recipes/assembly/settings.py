@@ -6,11 +6,14 @@ import dataclasses
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from typing import Any, TypeVar
 
 from assembly.errors import UserError
 
 T = TypeVar("T")
+
+_SEED_LIMIT = 2**63  # of torch's generators
 
 
 @dataclass(frozen=True)
@@ -198,10 +201,12 @@ def _value(hint: Any, value: Any, path: str) -> Any:
         return _fill(typing.cast(type, hint), value, path)
     wrong = UserError(f"`{path}` must be {_describe(hint)}, got {value!r}.")
     if hint is float:
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) != inf:
             return float(value)
     elif hint is int:
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and value == int(value):
+        if isinstance(value, int) and not isinstance(value, bool):
+            return value
+        if isinstance(value, float) and value.is_integer():
             return int(value)
     elif hint in (str, bool):
         if isinstance(value, hint):
@@ -221,7 +226,7 @@ def _value(hint: Any, value: Any, path: str) -> Any:
 def _describe(hint: Any) -> str:
     if typing.get_origin(hint) is list:
         return "a list"
-    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    names = {float: "a finite number", int: "a whole number", str: "text", bool: "true or false"}
     return names.get(hint, "text or null")
 
 
@@ -286,6 +291,9 @@ def _check(s: Settings) -> None:
     for name, value in not_negative.items():
         if not value >= 0:
             raise UserError(f"`{name}` must be 0 or more, got {value}.")
+    for name in ("seed", "missingness.mechanism_seed", "evaluation.seed"):
+        if not_negative[name] >= _SEED_LIMIT:
+            raise UserError(f"`{name}` must be under 2**63, got {not_negative[name]}.")
     if s.collector.steps_per_env % s.optim.sequence_length:
         raise UserError(
             f"`optim.sequence_length` must divide `collector.steps_per_env`, "

@@ -129,16 +129,17 @@ def filter_step(
         ll = _information_likelihood(wide, step, residual, weight, observed, log_det, row)
         step, ll = step.to(m.dtype), ll.to(m.dtype)
     else:
-        Q = constant_cov(model)
-        R = model.full_emission_cov()
-        cross, initial_cross = Q @ H.mT, model.initial_cov @ H.mT
-        S = torch.where(row.unsqueeze(-1), H @ initial_cross + R, H @ cross + R)
+        wide = _for_innovation(model)
+        wide_H, Q, R = wide.emission_matrix, constant_cov(wide), wide.full_emission_cov()
+        residual = residual.to(R.dtype)
+        cross, initial_cross = Q @ wide_H.mT, wide.initial_cov @ wide_H.mT
+        S = torch.where(row.unsqueeze(-1), wide_H @ initial_cross + R, wide_H @ cross + R)
         factor = torch.linalg.cholesky(masked_cov(S, observed))
         z = torch.cholesky_solve(residual.unsqueeze(-1), factor).squeeze(-1)
-        step = torch.where(row, z @ initial_cross.mT, z @ cross.mT)
+        step = torch.where(row, z @ initial_cross.mT, z @ cross.mT).to(m.dtype)
         log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        count = observed.sum(-1).to(m.dtype)
-        ll = -0.5 * ((z * residual).sum(-1) + log_det + count * LOG_2PI)
+        count = observed.sum(-1).to(R.dtype)  # an integer times a float would be float32
+        ll = (-0.5 * ((z * residual).sum(-1) + log_det + count * LOG_2PI)).to(m.dtype)
     ll = torch.where(observed.any(-1), ll, 0.0)
     cov = filtered_cov(model, observed, reset) if return_cov else None
     return FilterOutput(m + step, cov, ll)
@@ -218,7 +219,8 @@ def filter_sequence(
         :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
 
     Raises:
-        ValueError: if the asked form does not fit the model.
+        ValueError: if the asked form does not fit the model, or one of ``restart`` and
+            ``restart_mean`` is given without the other.
 
     Example:
         >>> import torch
@@ -234,6 +236,11 @@ def filter_sequence(
     """
     chosen = checked_form(model, form)
     check_observed(observation, observed)
+    if (restart is None) != (restart_mean is None):
+        raise ValueError(
+            "`restart` and `restart_mean` come together: restart says where, restart_mean says "
+            "from which belief."
+        )
     batch, time = reset.shape[:-1], reset.shape[-1]
     mean = mean.expand(*batch, mean.shape[-1])
 
@@ -301,6 +308,16 @@ def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, li
     return f, drive, [f.weights[0][:, :state], *rest]
 
 
+def _for_innovation(model: StateSpace) -> StateSpace:
+    """Return the model in the dtype in which its innovation covariance is factorised.
+
+    With more sensors than states (a full R) H Q H' is of low rank and the innovation covariance
+    as ill-conditioned as Q / R: float32 loses most digits there, float64 does not.
+    """
+    obs, state = model.emission_matrix.shape
+    return model.double() if obs > state else model
+
+
 def _innovation(
     model: StateSpace,
     start: Tensor,
@@ -312,12 +329,14 @@ def _innovation(
     stored: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     f, drive, weights = _network(model, action)
-    H, Q, R = model.emission_matrix, constant_cov(model), model.full_emission_cov()
-    cross, initial_cross = Q @ H.mT, model.initial_cov @ H.mT
+    wide = _for_innovation(model)
+    H, Q, R = wide.emission_matrix, constant_cov(wide), wide.full_emission_cov()
+    cross, initial_cross = Q @ H.mT, wide.initial_cov @ H.mT
     y = zero_missing(observation - model.offset(action), observed)
     _, mean, ll = InnovationRecurrence.apply(  # type: ignore[no-untyped-call]
         f.residual, f.activation, y, observed, reset, restart, stored, start, drive,
-        model.initial_mean, H, H @ cross + R, H @ initial_cross + R, cross, initial_cross, *weights,
+        model.initial_mean, model.emission_matrix, H @ cross + R, H @ initial_cross + R, cross,
+        initial_cross, *weights,
     )  # fmt: skip
     return mean, ll - (0.5 * LOG_2PI) * observed.sum(-1).to(ll.dtype)
 

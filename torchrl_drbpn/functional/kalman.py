@@ -147,23 +147,23 @@ def update(
         >>> mean.tolist(), torch.allclose(cov, expected)
         ([0.25, 0.0], True)
     """
-    H = emission_matrix
-    v, S = innovation(belief, observation, observed, H, emission_cov, offset)
-    factor = torch.linalg.cholesky(masked_cov(S, observed))
+    # In float64 whatever the dtype: with R at its floor beside a large P, S has a condition number
+    # of 1e6 and more, and the two terms of the covariance cancel along measured directions.
+    H, P, R = (x.double() for x in (emission_matrix, belief.cov, emission_cov))
+    v = innovation(belief, observation, observed, emission_matrix, emission_cov, offset).mean
+    factor = torch.linalg.cholesky(masked_cov(H @ P @ H.mT + R, observed))
     # K' = A^-1 (M'M) H P: the rows of missing entries are zero, so K ignores them.
-    seen_rows = observed.unsqueeze(-1)
-    cross = torch.where(seen_rows, H @ belief.cov, torch.zeros((), dtype=S.dtype, device=S.device))
+    cross = zero_missing(H @ P, observed.unsqueeze(-1))
     K = torch.cholesky_solve(cross, factor).mT
-    mean = belief.mean + (K @ v.unsqueeze(-1)).squeeze(-1)
-    eye = torch.eye(mean.shape[-1], dtype=mean.dtype, device=mean.device)
-    kept = eye - K @ H
-    cov = kept @ belief.cov @ kept.mT + K @ emission_cov @ K.mT
-    cov = 0.5 * (cov + cov.mT)
-    # Rounding errs by about eps sqrt(P_ii P_jj) in every entry. Directions measured thousands of
-    # times without a predict between hold less variance than that beside directions never
-    # measured, and the matrix would turn indefinite: raise the diagonal by the rounding unit.
-    lift = torch.finfo(cov.dtype).eps * belief.cov.diagonal(dim1=-2, dim2=-1).detach()
-    cov = cov + torch.diag_embed(lift)
+    mean = belief.mean + (K @ v.double().unsqueeze(-1)).squeeze(-1).to(v.dtype)
+    kept = torch.eye(mean.shape[-1], dtype=P.dtype, device=P.device) - K @ H
+    cov = kept @ P @ kept.mT + K @ R @ K.mT
+    cov = (0.5 * (cov + cov.mT)).to(v.dtype)
+    # Rounding errs by at most eps/2 sqrt(C_ii C_jj) in every entry. Directions measured thousands
+    # of times without a predict between hold less variance than that beside directions never
+    # measured; raising the diagonal by state * eps/2 of itself outweighs it whatever the signs.
+    unit = 0.5 * cov.shape[-1] * torch.finfo(cov.dtype).eps
+    cov = cov + torch.diag_embed(unit * cov.diagonal(dim1=-2, dim2=-1).detach())
     anything = observed.any(-1)[..., None, None]
     return Belief(mean, torch.where(anything, cov, belief.cov))
 
@@ -202,5 +202,10 @@ def log_likelihood(
         >>> torch.allclose(value, expected)
         True
     """
-    v, S = innovation(belief, observation, observed, emission_matrix, emission_cov, offset)
-    return masked_log_density(v, S, observed)
+    wide = Belief(belief.mean.double(), belief.cov.double())
+    H, R = emission_matrix.double(), emission_cov.double()
+    x, o = observation.double(), None if offset is None else offset.double()
+    # In float64 as in update: S is too ill-conditioned for float32 when R is at its floor.
+    return masked_log_density(*innovation(wide, x, observed, H, R, o), observed).to(
+        belief.mean.dtype
+    )

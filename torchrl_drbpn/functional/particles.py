@@ -184,7 +184,7 @@ class ParticleOutput(NamedTuple):
     expected: Tensor
 
 
-# --------------------------------------------------------------------------------- densities, weights
+# ------------------------------------------------------------------------------ densities, weights
 def diagonal_log_density(
     value: Tensor, gaussian: DiagonalGaussian, observed: Tensor | None = None
 ) -> Tensor:
@@ -263,7 +263,7 @@ def effective_sample_size(log_weight: Tensor) -> Tensor:
     return 1.0 / log_weight.softmax(-1).square().sum(-1)
 
 
-# ----------------------------------------------------------------------------------------- resampling
+# -------------------------------------------------------------------------------------- resampling
 @torch.no_grad()
 def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
     r"""Choose the particles that go on, by systematic resampling.
@@ -312,7 +312,7 @@ def resample(values: Tensor, ancestors: Tensor) -> Tensor:
     return values.gather(-2, ancestors.unsqueeze(-1).expand_as(values))
 
 
-# ------------------------------------------------------------------------------ one step, one sequence
+# --------------------------------------------------------------------------- one step, one sequence
 def particle_step(
     model: ParticleModel,
     hidden: Tensor,
@@ -368,9 +368,7 @@ def particle_step(
     # log p - log q: the constants cancel, and (z - mean_q)^2 / variance_q is the noise squared.
     surprise = (latent - transition.mean).square() / transition.variance
     ratio = noise.proposal.square() - surprise + (proposal.variance / transition.variance).log()
-    seen = diagonal_log_density(
-        observation.unsqueeze(-2), outcome.emission, observed.unsqueeze(-2)
-    )
+    seen = diagonal_log_density(observation.unsqueeze(-2), outcome.emission, observed.unsqueeze(-2))
     log_weight = 0.5 * ratio.sum(-1) + seen
     return ParticleOutput(
         outcome.hidden,

@@ -279,9 +279,10 @@ class InnovationRecurrence(torch.autograd.Function):
 
         # Masking by products and lerp with weights of exactly 0 or 1: the same numbers as
         # torch.where, which costs several times as much on these, the largest tensors here.
-        mask = observed.to(y.dtype)
+        # The covariances may come in float64 (see _innovation); the loop runs in its own dtype.
+        mask = observed.to(cov.dtype)
         both = mask.unsqueeze(-1) * mask.unsqueeze(-2)
-        at_reset = reset.to(y.dtype).unsqueeze(-1)
+        at_reset = reset.to(cov.dtype).unsqueeze(-1)
         masked = torch.lerp(cov, initial_cov, at_reset) * both
         masked.diagonal(dim1=-2, dim2=-1).add_(1.0 - mask)
         inverse, log_det = _spd_inverse(masked)
@@ -290,17 +291,17 @@ class InnovationRecurrence(torch.autograd.Function):
         shape = (time, batch, obs, state)
         gain = torch.lerp(
             (flat @ cross.t()).view(shape), (flat @ initial_cross.t()).view(shape), at_reset
-        )
+        ).to(start.dtype)
 
         predicted, filtered, inputs, hidden = _run(
             steps, drive, start, reset, initial_mean, restart, restart_mean, gain, y, H
         )
         m, mean = torch.stack(predicted), torch.stack(filtered)
-        r = torch.where(
-            observed, torch.addmm(y.flatten(0, 1), m.flatten(0, 1), H.t(), alpha=-1).view_as(y), 0.0
-        )
+        wide_y, wide_m, wide_H = (v.to(cov.dtype) for v in (y, m, H))
+        error = torch.addmm(wide_y.flatten(0, 1), wide_m.flatten(0, 1), wide_H.t(), alpha=-1)
+        r = torch.where(observed, error.view_as(y), 0.0)
         z = (inverse @ r.unsqueeze(-1)).squeeze(-1)
-        ll = -0.5 * ((z * r).sum(-1) + log_det)
+        ll = (-0.5 * ((z * r).sum(-1) + log_det)).to(start.dtype)
 
         layers = [torch.stack([h[i] for h in hidden]) for i in range(len(hidden[0]))]
         ctx.save_for_backward(
@@ -324,7 +325,7 @@ class InnovationRecurrence(torch.autograd.Function):
 
         g_mean = torch.zeros_like(m) if g_mean is None else g_mean
         g_ll = torch.zeros_like(m[..., 0]) if g_ll is None else g_ll
-        by_ll = -g_ll.unsqueeze(-1) * z  # d ll / d r = -z
+        by_ll = (-g_ll.unsqueeze(-1) * z).to(m.dtype)  # d ll / d r = -z
         back = _run_back(steps, reset, restart, gain, layers, g_mean, g_m, by_ll, H)
 
         g_e = back.error  # by the innovation: u - g_ll z, with u = M A^-1 G' g
@@ -340,7 +341,10 @@ class InnovationRecurrence(torch.autograd.Function):
 
         flat_inverse = inverse.reshape(-1, obs * obs)
         g_cov, g_cross = [], []
-        for left_i, half_i, g_i in zip(split(left), split(half), split(back.filtered), strict=True):
+        outer = back.filtered.to(z.dtype)
+        for left_i, half_i, g_i in zip(
+            split(left), split(half.to(z.dtype)), split(outer), strict=True
+        ):
             by_cov = left_i.t() @ zf - (half_i.t() @ flat_inverse).view(obs, obs)
             g_cov.append(0.5 * (by_cov + by_cov.t()))
             g_cross.append(g_i.t() @ zf)

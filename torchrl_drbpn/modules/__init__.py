@@ -3,6 +3,8 @@
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.export import PolicyStep
+from torchrl_drbpn.modules.particle_filter import ParticleFilterModule
+from torchrl_drbpn.modules.particle_model import ParticleFilter
 from torchrl_drbpn.modules.state_space import GaussianTransition, LinearGaussianEmission
 
 __all__ = [
@@ -10,5 +12,7 @@ __all__ = [
     "BeliefFilterModule",
     "GaussianTransition",
     "LinearGaussianEmission",
+    "ParticleFilter",
+    "ParticleFilterModule",
     "PolicyStep",
 ]

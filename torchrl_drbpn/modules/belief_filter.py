@@ -16,11 +16,12 @@ from torchrl_drbpn.functional import (
     filter_step,
     predict_step,
 )
-from torchrl_drbpn.functional.model import Form
+from torchrl_drbpn.functional.model import Form, checked_form
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
     LinearGaussianEmission,
+    check_dim,
     initial_covariance,
 )
 
@@ -60,7 +61,8 @@ class BeliefFilter(nn.Module):
         dtype: of the parameters.
 
     Raises:
-        ValueError: for a dimension under 1, or parts whose dimensions disagree.
+        ValueError: for a dimension under 1, parts whose dimensions disagree, or a ``form`` that
+            does not fit them.
 
     Example:
         >>> import torch
@@ -90,9 +92,11 @@ class BeliefFilter(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
+        obs_dim, action_dim = check_dim("obs_dim", obs_dim), check_dim("action_dim", action_dim)
         if state_dim is None:
             given = getattr(transition, "state_dim", None) or getattr(emission, "state_dim", None)
             state_dim = given or min(obs_dim, _MAX_DEFAULT_STATE)
+        state_dim = check_dim("state_dim", state_dim)
         if transition is None:
             transition = GaussianTransition(
                 state_dim,
@@ -123,6 +127,7 @@ class BeliefFilter(nn.Module):
         self.emission = emission
         self.initial_mean = nn.Parameter(torch.zeros(state_dim, device=device, dtype=dtype))
         self.initial_noise = initial_covariance(state_dim, initial_cov, initial_std, device, dtype)
+        checked_form(self.state_space(), form)
 
     def reset_parameters(self) -> None:
         """Start again, the parts included where they know how."""
@@ -205,7 +210,7 @@ class BeliefFilter(nn.Module):
             return_cov=return_cov,
             form=self.form,
         )
-        self._check_values(out, observation, observed)
+        self._check_values(out, mean, previous_action, observation, observed)
         return out
 
     # ------------------------------------------------------------------ a sequence
@@ -263,7 +268,7 @@ class BeliefFilter(nn.Module):
             return_cov=return_cov,
             form=self.form,
         )
-        self._check_values(out, observation, observed)
+        self._check_values(out, mean, previous_action, observation, observed)
         return out
 
     def predict(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
@@ -316,11 +321,21 @@ class BeliefFilter(nn.Module):
                     "TorchRL's DoubleToFloat to the environment, or build the filter with dtype=."
                 )
 
-    def _check_values(self, out: FilterOutput, observation: Tensor, observed: Tensor) -> None:
-        """Raise on a value that cannot be; one reduction over (*batch,) tells."""
+    def _check_values(
+        self,
+        out: FilterOutput,
+        mean: Tensor,
+        previous_action: Tensor,
+        observation: Tensor,
+        observed: Tensor,
+    ) -> None:
+        """Raise on a value that cannot be; two sums and one number on the host tell.
+
+        The mean is looked at too: where nothing was observed the likelihood is 0 whatever it is.
+        """
         if not self.validate or torch.compiler.is_compiling():
             return
-        if bool(torch.isfinite(out.log_likelihood).all()):
+        if bool(torch.isfinite(out.log_likelihood.sum() + out.mean.sum())):
             return
         bad = observed & ~torch.isfinite(observation)
         if bool(bad.any()):
@@ -330,6 +345,12 @@ class BeliefFilter(nn.Module):
                 f"(components {components}): mark them missing, for example with "
                 "ObservedFromNaN."
             )
+        for name, value in (("previous_action", previous_action), ("mean", mean)):
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(
+                    f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "
+                    "by a policy or a filter that had diverged?"
+                )
         raise ValueError(
             "the belief is no longer finite although every observed entry is: the learned model "
             "diverged. Lower the learning rate, or use residual=False where state > obs."

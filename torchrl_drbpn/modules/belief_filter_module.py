@@ -73,7 +73,9 @@ class BeliefFilterModule(TensorDictModuleBase):
         default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
 
     Raises:
-        ValueError: for a key list of another length, an unknown name, or an unknown choice.
+        TypeError: if keys are neither a list nor a dict.
+        ValueError: for a key list of another length, an unknown name, a key given twice, or an
+            unknown choice.
 
     Example:
         >>> import torch
@@ -109,9 +111,9 @@ class BeliefFilterModule(TensorDictModuleBase):
         self._default_recurrent_mode = default_recurrent_mode
         self._warned = False
         self.in_keys = _read_in_keys(in_keys)
-        self._out = _read_out_keys(out_keys)
         self._next_mean = unravel_key(("next", self.in_keys[4]))
         self._next_age = unravel_key(("next", self.in_keys[5]))
+        self._out = _read_out_keys(out_keys, [self._next_mean, self._next_age])
         self.out_keys = [*self._out.values(), self._next_mean, self._next_age]
 
     # ------------------------------------------------------------------ forward
@@ -262,6 +264,24 @@ def _steps_since(reset: Tensor) -> Tensor:
     return (index - last).unsqueeze(-1)
 
 
+def _as_keys(given: Sequence[NestedKey], name: str) -> list[NestedKey]:
+    """Return a list of keys; a key may be any sequence of strings, as configurations give them."""
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise TypeError(
+            f"`{name}` must be a list of keys or a dict, got {given!r} of type "
+            f"{type(given).__name__}."
+        )
+    return [unravel_key(key if isinstance(key, str) else tuple(key)) for key in given]
+
+
+def _check_distinct(keys: Sequence[NestedKey], name: str) -> None:
+    twice = sorted({str(key) for key in keys if list(keys).count(key) > 1})
+    if twice:
+        raise ValueError(
+            f"`{name}` must give every entry a key of its own, got {', '.join(twice)} twice."
+        )
+
+
 def _read_in_keys(
     given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
 ) -> list[NestedKey]:
@@ -271,18 +291,22 @@ def _read_in_keys(
         unknown = [key for key in given if key not in IN_KEYS]
         if unknown:
             raise ValueError(f"`in_keys` names {unknown}; the filter reads {list(IN_KEYS)}.")
-        return [unravel_key(given.get(key, key)) for key in IN_KEYS]
-    keys = [unravel_key(key) for key in given]
-    if len(keys) not in (4, 6):
-        raise ValueError(
-            f"`in_keys` must have 4 or 6 entries, in the order {list(IN_KEYS)}, got {keys}. To "
-            "rename one of them pass a dict such as {'observation': 'pixels_encoded'}."
-        )
-    return keys if len(keys) == 6 else [*keys, *IN_KEYS[4:]]
+        keys = [unravel_key(given.get(key, key)) for key in IN_KEYS]
+    else:
+        keys = _as_keys(given, "in_keys")
+        if len(keys) not in (4, 6):
+            raise ValueError(
+                f"`in_keys` must have 4 or 6 entries, in the order {list(IN_KEYS)}, got {keys}. "
+                "To rename one of them pass a dict such as {'observation': 'pixels_encoded'}."
+            )
+        keys = keys if len(keys) == 6 else [*keys, *IN_KEYS[4:]]
+    _check_distinct(keys, "in_keys")
+    return keys
 
 
 def _read_out_keys(
     given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
+    recurrent: Sequence[NestedKey],
 ) -> dict[NestedKey, NestedKey]:
     """Map the canonical names to the user's keys; recurrent entries in a list are implied."""
     names = (*DEFAULT_OUT_KEYS, *OPTIONAL_OUT_KEYS)
@@ -291,12 +315,13 @@ def _read_out_keys(
     if isinstance(given, Mapping):
         pairs = {unravel_key(name): unravel_key(key) for name, key in given.items()}
     else:
-        keys = [unravel_key(key) for key in given]
-        pairs = {key: key for key in keys if not (isinstance(key, tuple) and key[0] == "next")}
+        pairs = {key: key for key in _as_keys(given, "out_keys") if key not in recurrent}
     unknown = [name for name in pairs if name not in names]
     if unknown:
         raise ValueError(
-            f"`out_keys` names {unknown}; the filter can write {list(names)}. To write one under "
-            "another key pass a dict such as {'features': 'embed'}."
+            f"`out_keys` names {unknown}; the filter can write {list(names)}, and writes "
+            f"{list(recurrent)} in any case. To write one under another key pass a dict such as "
+            "{'features': 'embed'}; to rename the recurrent state pass in_keys."
         )
+    _check_distinct([*pairs.values(), *recurrent], "out_keys")
     return pairs

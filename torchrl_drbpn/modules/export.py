@@ -27,13 +27,13 @@ class PolicyStep(nn.Module):
     .. math::
         m_t = m^-_t + K_t (x_t - H m^-_t - B a_{t-1} - d), \qquad a_t = \mu(m_t)
 
-    Eq. (8), (10), (11) [DRBPN], the same numbers as the belief module followed by the policy's
-    mean action. It is a frozen copy: later training does not reach it. What the parameters alone
-    determine is computed once, here, and kept in buffers: Q H', P_0 H' and both innovation
-    covariances H P H' + R, or in the information form (diagonal R, obs > state) the precisions
-    and the products h_i h_i'. A step is left with one small factorisation, the transition network
-    and the head. A transition of the user's own, or a Q that is a network, is evaluated as it is
-    at every step.
+    The same numbers as the belief module followed by the policy's mean action: the equations are
+    those of :class:`~torchrl_drbpn.BeliefFilter`. It is a frozen copy: later training does not
+    reach it. What the parameters alone determine is computed once, here, and kept in buffers: Q H',
+    P_0 H' and both innovation covariances H P H' + R, or in the information form (diagonal R,
+    obs > state) the precisions and the products h_i h_i'. A step is left with one small
+    factorisation, the transition network and the head. A transition of the user's own, or a Q that
+    is a network, is evaluated as it is at every step.
 
     It has no TensorDict and no branch on values, so ``torch.export.export`` takes it, with a
     dynamic batch too, and ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time.

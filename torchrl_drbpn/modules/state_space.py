@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from numbers import Integral
 from typing import Literal
 
 import torch
@@ -23,10 +24,11 @@ CovKind = Literal["diag", "full"]
 _MIN_INITIAL_STD = 1e-3
 
 
-def _check_dim(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+def check_dim(name: str, value: int) -> int:
+    """Return a dimension as int, NumPy's integers included; ValueError where it is none."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
         raise ValueError(f"`{name}` must be an int of at least 1, got {value!r}.")
-    return value
+    return int(value)
 
 
 def _check_std(init_std: float, min_std: float) -> None:
@@ -166,8 +168,8 @@ class GaussianTransition(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        self.state_dim = _check_dim("state_dim", state_dim)
-        self.action_dim = _check_dim("action_dim", action_dim)
+        self.state_dim = check_dim("state_dim", state_dim)
+        self.action_dim = check_dim("action_dim", action_dim)
         _check_choice("activation", activation, ("relu", "tanh"))
         _check_choice("cov", cov, ("diag", "full"))
         _check_std(init_std, min_std)
@@ -303,9 +305,9 @@ class LinearGaussianEmission(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        self.obs_dim = _check_dim("obs_dim", obs_dim)
-        self.state_dim = _check_dim("state_dim", state_dim)
-        self.action_dim = _check_dim("action_dim", action_dim)
+        self.obs_dim = check_dim("obs_dim", obs_dim)
+        self.state_dim = check_dim("state_dim", state_dim)
+        self.action_dim = check_dim("action_dim", action_dim)
         if fixed_matrix and state_dim < obs_dim:
             raise ValueError(
                 "`fixed_matrix` needs state_dim >= obs_dim, since H = [I 0] must reach every "

@@ -117,7 +117,13 @@ class BeliefModelLoss(LossModule):
         if next_ll is not None:
             last = last_steps(tensordict, done=keys.done, final=keys.final, like=ll)
             ll = ll + torch.where(last, next_ll, 0.0)
-            next_entries = tensordict.get(keys.next_observed).sum(-1)
+            next_observed = tensordict.get(keys.next_observed, None)
+            if next_observed is None:
+                raise KeyError(
+                    f"`{keys.next_observed}` is not in the tensordict although "
+                    f"`{keys.next_log_likelihood}` is: the mask says how many entries it counts."
+                )
+            next_entries = next_observed.sum(-1)
             entries = entries + torch.where(last, next_entries, 0)
             steps = steps + last
         valid = self._valid(tensordict, ll)

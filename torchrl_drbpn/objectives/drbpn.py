@@ -238,6 +238,8 @@ class DRBPNLoss(LossModule):
         where = last_steps(data, done=keys.done, final=keys.final, like=log_likelihood).nonzero(
             as_tuple=True
         )
+        if not where[0].numel():
+            return  # no row ends here; not every belief module takes an empty batch
         gathered = TensorDict({}, batch_size=where[0].shape)
         for key in self.filter_network.in_keys:
             following = data.get(("next", key), None)

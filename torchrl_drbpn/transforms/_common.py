@@ -42,6 +42,11 @@ def as_key_list(keys: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
         TypeError: if something in `keys` is no nested key.
     """
     items = [keys] if isinstance(keys, str | tuple) else list(keys)
+    # Configurations know no tuples: inside a list, a sequence of strings is a nested key as well.
+    items = [
+        tuple(key) if isinstance(key, Sequence) and not isinstance(key, str) else key
+        for key in items
+    ]
     for key in items:
         flat = key if isinstance(key, tuple) else (key,)
         if not flat or not all(isinstance(part, str) for part in flat):
@@ -137,7 +142,8 @@ def observation_leaf(spec: Composite, key: NestedKey, owner: Transform) -> Tenso
         raise ValueError(
             f"`{key}` must be a vector of floating point numbers for `{name}`, of shape "
             f"(*batch, obs) with batch {tuple(parent.shape)}, got {leaf.dtype} of shape "
-            f"{tuple(leaf.shape)}. Flatten it first, as with FlattenObservation or CatTensors."
+            f"{tuple(leaf.shape)}. Flatten or cast it first, as with FlattenObservation, "
+            "CatTensors or DTypeCastTransform."
         )
     return leaf
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any, ClassVar
 
 import torch
@@ -41,11 +42,11 @@ def check_seed(seed: int, name: str = "seed") -> int:
         TypeError: if it is no integer.
         ValueError: if it is negative or too large for a 64-bit integer.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int):
+    if isinstance(seed, bool) or not isinstance(seed, Integral):
         raise TypeError(f"`{name}` must be an integer, got {seed!r} of type {type(seed).__name__}.")
     if not 0 <= seed < 1 << _SEED_BITS:
         raise ValueError(f"`{name}` must lie in [0, 2**{_SEED_BITS}), got {seed}.")
-    return seed
+    return int(seed)
 
 
 class SeededTransform(OrderedTransform):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Real
 from typing import ClassVar
 
 import torch
@@ -48,7 +49,8 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
     Missing entries become 0, NaN and inf beneath included, and False in the mask, which is ANDed
     into one that is there already. One seed gives one sequence of masks. The workers of a batched
     environment that are built by one function share a seed and so their masks, until `seed_env`
-    gives each its own. Several observation keys count as one vector.
+    gives each its own. Several observation keys count as one vector. Two of them in one environment
+    need different seeds, or they lose the same entries.
 
     Args:
         mechanism: "mcar", "mar" or "nmar".
@@ -82,6 +84,7 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
 
     role: ClassVar[Role] = "missingness"
     stream: ClassVar[int] = 2
+    _eta: float
 
     def __init__(
         self,
@@ -116,7 +119,7 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
 
     @eta.setter
     def eta(self, eta: float) -> None:
-        if not isinstance(eta, int | float) or not 0.0 <= eta <= 1.0:
+        if not isinstance(eta, Real) or not 0.0 <= eta <= 1.0:
             raise ValueError(f"`eta` must be a missing rate in [0, 1], got {eta!r}.")
         self._eta = float(eta)
 

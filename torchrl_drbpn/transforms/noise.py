@@ -70,11 +70,14 @@ class ObservationNoise(SeededTransform, CorruptingTransform):
     ) -> None:
         super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
         self.noise_std: float | Tensor
-        std = torch.as_tensor(noise_std, dtype=torch.float64)
+        try:
+            std = torch.as_tensor(noise_std, dtype=torch.float64)
+        except (TypeError, ValueError):
+            std = torch.tensor(math.nan)
         if std.ndim > 1 or not bool(((std >= 0) & (std < math.inf)).all()):
             raise ValueError(
                 "`noise_std` must be a number or one number per component, finite and not "
-                f"negative, in observation units, got {noise_std}."
+                f"negative, in observation units, got {noise_std!r}."
             )
         self.noise_std = float(std) if std.ndim == 0 else std
         self._cast_std = self.noise_std

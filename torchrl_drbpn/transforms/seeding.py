@@ -47,7 +47,8 @@ def seed_env(env: EnvBase, seed: int) -> int | None:
         >>> bool((first() == first()).all())
         True
     """
-    next_seed: int | None = env.set_seed(check_seed(seed))
+    seed = check_seed(seed)
+    next_seed: int | None = env.set_seed(seed)
     source = torch.Generator().manual_seed(seed)
     for set_seed in _seed_setters(env):
         set_seed(int(torch.randint(2**62, (), generator=source)))

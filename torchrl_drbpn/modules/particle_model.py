@@ -1,0 +1,404 @@
+"""The networks of deep variational reinforcement learning, and their particle filter on tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear, softplus
+
+from torchrl_drbpn.functional import (
+    DiagonalGaussian,
+    Outcome,
+    ParticleNoise,
+    ParticleOutput,
+    Prospect,
+    particle_sequence,
+    zero_missing,
+)
+from torchrl_drbpn.functional.gaussian import check_observed
+
+__all__ = ["ParticleFilter"]
+
+_ENTRIES = 1 << 18  # places in the noise table: 1 MB in float32
+_WORD, _MIX = (1 << 32) - 1, (0x7FB5D329728EA185, 0x1B03738712FAD5C9)
+
+
+class ParticleFilter(nn.Module):
+    r"""Filter with particles whose proposal, transition and emission are learned.
+
+    .. math::
+        z_t \sim q(z \mid h_{t-1}, x_t^{obs}, m_t, a_{t-1}), \qquad
+        h_t = \mathrm{GRU}(h_{t-1}, [z_t, x_t^{obs}, m_t, a_{t-1}]), \qquad
+        w_t = \frac{p(z_t \mid h_{t-1}, a_{t-1})\; p(x_t^{obs} \mid h_{t-1}, z_t, a_{t-1})}
+                   {q(z_t \mid \cdot)}
+
+    §3 [DVRL 2018] with the networks and widths of its authors' code for vector observations.
+    Every step begins by resampling the particles of the step before (systematic); a recurrent
+    network over the particles, each with its weight, makes the features. Differs from it: the
+    encoder reads the mask beside the observation, the emission counts the entries that arrived,
+    and variances have a floor, without which the likelihood of clean data has no bound.
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+
+    Keyword Args:
+        num_particles: K; one particle is a sequential variational auto-encoder.
+        hidden_dim: components of h, and of the features.
+        latent_dim: components of z.
+        encoder_sizes: units of the two layers that read an observation; the decoder mirrors them.
+        action_width: units of the layer that reads an action.
+        min_std: floor of the emission's standard deviation, observation units.
+        latent_min_std: floor of the proposal's and the transition's.
+        noise_seed: of the table that the noise is read from, see :meth:`noise`.
+        validate: look at values too: a NaN or inf that the mask calls observed raises ValueError.
+            Needs a value on the host, so it is skipped while compiling or exporting.
+        device: of the parameters.
+        dtype: of the parameters.
+
+    Raises:
+        ValueError: for a size under 1, a negative floor, or inputs of the wrong shape.
+
+    Example:
+        >>> import torch
+        >>> filter = ParticleFilter(5, 2, num_particles=4, hidden_dim=8, latent_dim=3)
+        >>> action, x = torch.zeros(6, 10, 2), torch.randn(6, 10, 5)
+        >>> observed = torch.rand(6, 10, 5) < 0.7
+        >>> noise = ParticleNoise.sample((6, 10), 4, 3, torch.Generator().manual_seed(0))
+        >>> start = torch.zeros(6, 10, dtype=torch.bool)
+        >>> out = filter(
+        ...     torch.zeros(6, 10, 4, 8), torch.zeros(6, 10, 4), start, action, x, observed, noise)
+        >>> filter.features(out).shape, out.log_likelihood.shape
+        (torch.Size([6, 10, 8]), torch.Size([6, 10]))
+
+    See also :class:`torchrl_drbpn.ParticleFilterModule`, the same with TensorDict keys.
+    """
+
+    noise_table: Tensor
+    noise_multipliers: Tensor
+
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        *,
+        num_particles: int = 10,
+        hidden_dim: int = 128,
+        latent_dim: int = 256,
+        encoder_sizes: Sequence[int] = (64, 64),
+        action_width: int = 64,
+        min_std: float = 1e-2,
+        latent_min_std: float = 1e-3,
+        noise_seed: int = 0,
+        validate: bool = True,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        sizes = {
+            "obs_dim": obs_dim,
+            "action_dim": action_dim,
+            "num_particles": num_particles,
+            "hidden_dim": hidden_dim,
+            "latent_dim": latent_dim,
+            "action_width": action_width,
+            **{f"encoder_sizes[{i}]": size for i, size in enumerate(encoder_sizes)},
+        }
+        for name, size in sizes.items():
+            if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+                raise ValueError(f"`{name}` must be an int of at least 1, got {size!r}.")
+        if len(encoder_sizes) != 2:
+            raise ValueError(f"`encoder_sizes` must be two sizes, got {list(encoder_sizes)}.")
+        for name, value in (("min_std", min_std), ("latent_min_std", latent_min_std)):
+            if not value >= 0:
+                raise ValueError(f"`{name}` must be at least 0, got {value}.")
+        self.obs_dim, self.action_dim = obs_dim, action_dim
+        self.num_particles, self.hidden_dim, self.latent_dim = num_particles, hidden_dim, latent_dim
+        self.min_std, self.latent_min_std = min_std, latent_min_std
+        self.noise_seed, self.validate = noise_seed, validate
+
+        first, last = encoder_sizes
+        given: dict[str, Any] = {"device": device, "dtype": dtype}
+        self.encoder = _layers([2 * obs_dim, first, last], given)
+        self.action_encoder = _layers([action_dim, action_width], given)
+        self.latent_encoder = _layers([latent_dim, hidden_dim], given)
+        # The columns of h come first: what the particles of a row share is multiplied once.
+        self.proposal = nn.Linear(hidden_dim + last + action_width, hidden_dim, **given)
+        self.proposal_head = nn.Linear(hidden_dim, 2 * latent_dim, **given)
+        self.transition = nn.Linear(hidden_dim + action_width, hidden_dim, **given)
+        self.transition_head = nn.Linear(hidden_dim, 2 * latent_dim, **given)
+        self.emission = nn.Linear(2 * hidden_dim + action_width, last, **given)
+        self.decoder = _layers([last, first], given)
+        self.emission_head = nn.Linear(first, 2 * obs_dim, **given)
+        self.memory = nn.GRUCell(hidden_dim + last + action_width, hidden_dim, **given)
+        particle = 2 * hidden_dim + 1
+        # Weights of a GRU over the particles; torch.compile does not let an nn.GRU hold them.
+        self.aggregator: nn.Linear | nn.GRUCell = (
+            nn.Linear(particle, hidden_dim, **given)
+            if num_particles == 1
+            else nn.GRUCell(particle, hidden_dim, **given)
+        )
+        self.reset_parameters()
+
+        generator = torch.Generator().manual_seed(noise_seed)
+        window = num_particles * latent_dim
+        table = torch.randn(_ENTRIES + window - 1, generator=generator, dtype=dtype)
+        multipliers = torch.randint(-(1 << 62), 1 << 62, (2 * obs_dim + action_dim + 1,),
+                                    generator=generator)  # fmt: skip
+        # They follow from the seed: no checkpoint has to hold them.
+        self.register_buffer("noise_table", table.to(device), persistent=False)
+        odd = (2 * multipliers + 1).to(device)
+        self.register_buffer("noise_multipliers", odd, persistent=False)
+
+    def reset_parameters(self) -> None:
+        """Start again: orthogonal weights and zero biases, as the authors' code has them."""
+        gain = nn.init.calculate_gain("relu")
+        nn.init.orthogonal_(self.memory.weight_ih)
+        nn.init.orthogonal_(self.memory.weight_hh)
+        nn.init.zeros_(self.memory.bias_ih)
+        nn.init.zeros_(self.memory.bias_hh)
+        if isinstance(self.aggregator, nn.GRUCell):
+            self.aggregator.reset_parameters()  # PyTorch's own, in the authors' code too
+        for name, part in self.named_modules():
+            if isinstance(part, nn.Linear):
+                # A head is two layers in one: mean and variance are orthogonal each by itself.
+                for block in part.weight.chunk(2 if name.endswith("_head") else 1):
+                    nn.init.orthogonal_(block, gain)
+                nn.init.zeros_(part.bias)
+
+    # ------------------------------------------------------------------ one step, a sequence
+    def forward(
+        self,
+        hidden: Tensor,
+        log_weight: Tensor,
+        begin: Tensor,
+        previous_action: Tensor,
+        observation: Tensor,
+        observed: Tensor,
+        noise: ParticleNoise,
+    ) -> ParticleOutput:
+        """Filter sequences; the arguments with ``time`` have it behind the batch.
+
+        Args:
+            hidden: h of the step before each step, shape ``(*batch, time, particles, hidden)``;
+                read at the first step and where ``begin`` says so. Zeros start an episode.
+            log_weight: the same of the weights, shape ``(*batch, time, particles)``, nats.
+            begin: bool, shape ``(*batch, time)``.
+            previous_action: shape ``(*batch, time, action)``.
+            observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
+            observed: bool, shape ``(*batch, time, obs)``, True = arrived.
+            noise: see :meth:`noise` and :class:`torchrl_drbpn.functional.ParticleNoise`.
+
+        Returns:
+            The particles after every step.
+
+        Raises:
+            ValueError: for a mask of another shape, or values that are not finite.
+        """
+        check_observed(observation, observed)
+        zeroed = zero_missing(observation, observed)
+        seen = self.encoder(torch.cat([zeroed, observed.to(zeroed.dtype)], -1))
+        action = self.action_encoder(previous_action)
+        networks = self._networks()
+        inputs = networks.share(torch.cat([seen, action], -1), action)
+        out = particle_sequence(
+            networks, hidden, log_weight, begin, inputs, zeroed, observed, noise
+        )
+        self._check_values(out.log_likelihood, observation, observed)
+        return out
+
+    def step(
+        self,
+        hidden: Tensor,
+        log_weight: Tensor,
+        previous_action: Tensor,
+        observation: Tensor,
+        observed: Tensor,
+        noise: ParticleNoise,
+    ) -> ParticleOutput:
+        """Filter one step, any batch: :meth:`forward` without its time.
+
+        Args:
+            hidden: h of the step before, shape ``(*batch, particles, hidden)``.
+            log_weight: of the step before, shape ``(*batch, particles)``, nats.
+            previous_action: shape ``(*batch, action)``.
+            observation: shape ``(*batch, obs)``.
+            observed: bool, shape ``(*batch, obs)``.
+            noise: without time.
+
+        Returns:
+            The particles after the step, without time.
+        """
+        begin = torch.ones((*observation.shape[:-1], 1), dtype=torch.bool, device=hidden.device)
+        rank = observation.ndim - 1
+        parts = (previous_action, observation, observed)
+        out = self(
+            hidden.unsqueeze(rank),
+            log_weight.unsqueeze(rank),
+            begin,
+            *(part.unsqueeze(rank) for part in parts),
+            ParticleNoise(*(part.unsqueeze(rank) for part in noise)),
+        )
+        return ParticleOutput(*(part.squeeze(rank) for part in out))
+
+    def features(self, particles: ParticleOutput) -> Tensor:
+        """Gather the particles into one vector, with a recurrent network over them.
+
+        Args:
+            particles: after one step or after each of a sequence.
+
+        Returns:
+            Shape ``(*batch, [time,] hidden)``.
+        """
+        weight = particles.log_weight.softmax(-1).unsqueeze(-1)
+        each = torch.cat([particles.hidden, particles.embedding, weight], -1)
+        net = self.aggregator
+        if isinstance(net, nn.Linear):
+            return linear(each.squeeze(-2), net.weight, net.bias)
+        flat = each.reshape(-1, *each.shape[-2:])
+        start = flat.new_zeros(1, flat.shape[0], self.hidden_dim)
+        weights = [net.weight_ih, net.weight_hh, net.bias_ih, net.bias_hh]
+        _, last = torch.gru(flat, start, weights, True, 1, 0.0, self.training, False, True)
+        return last.reshape(*each.shape[:-2], self.hidden_dim)
+
+    # ------------------------------------------------------------------ noise
+    @torch.no_grad()
+    def noise(
+        self, previous_action: Tensor, observation: Tensor, observed: Tensor, age: Tensor
+    ) -> ParticleNoise:
+        """Look up the noise of a step: pseudo-random, and the same whenever it is asked for.
+
+        PPO compares the policy that collected a step with the policy that learns from it, so
+        both must see the same particles. What a step brings (observation, mask, action, age) and
+        the seed are hashed; the hash chooses a place in a fixed table of standard normal numbers
+        and the start of the resampling. So nothing has to be stored or carried along, a step has
+        one noise in the collector, in GAE and in the loss, and no generator's state belongs into
+        a checkpoint. Numbers are read in float32, so that casting data keeps its noise.
+
+        Args:
+            previous_action: shape ``(*batch, action)``.
+            observation: shape ``(*batch, obs)``.
+            observed: bool, shape ``(*batch, obs)``.
+            age: steps since the reset, int64, shape ``(*batch, 1)``.
+
+        Returns:
+            The noise.
+        """
+        # Adding 0 turns -0 into 0.
+        numbers = torch.cat([zero_missing(observation, observed), previous_action], -1) + 0.0
+        bits = numbers.to(torch.float32).contiguous().view(torch.int32)
+        words = torch.cat([bits.to(torch.int64), observed.to(torch.int64), age], -1)
+        # Multilinear hashing of 32-bit words modulo 2**64, then a mixing of its bits.
+        key = (words * self.noise_multipliers).sum(-1)
+        for factor in _MIX:
+            key = (key ^ ((key >> 32) & _WORD)) * factor
+        key = key ^ ((key >> 32) & _WORD)
+        place = key & (_ENTRIES - 1)
+        uniform = ((key >> 32) & 0xFFFFFF).to(self.noise_table.dtype) / (1 << 24)
+        window = self.num_particles * self.latent_dim
+        offset = torch.arange(window, device=key.device)
+        proposal = self.noise_table[place.unsqueeze(-1) + offset]
+        shape = (*key.shape, self.num_particles, self.latent_dim)
+        return ParticleNoise(proposal.reshape(shape), uniform.unsqueeze(-1))
+
+    # ------------------------------------------------------------------ inside
+    def _networks(self) -> _Networks:
+        """Sort the weights by what they multiply, so that each is one product a step."""
+        h, cell = self.hidden_dim, self.memory
+        proposal, transition = self.proposal, self.transition
+        emission = self.emission.weight
+        parts = [proposal.weight[:, :h], transition.weight[:, :h], emission[:, :h], cell.weight_hh]
+        return _Networks(
+            own=torch.cat(parts),
+            gate_bias=cell.bias_hh,
+            seen=torch.cat([proposal.weight[:, h:], cell.weight_ih[:, h:]]),
+            seen_bias=torch.cat([proposal.bias, cell.bias_ih]),
+            moved=torch.cat([transition.weight[:, h:], emission[:, 2 * h :]]),
+            moved_bias=torch.cat([transition.bias, self.emission.bias]),
+            drawn=torch.cat([emission[:, h : 2 * h], cell.weight_ih[:, :h]]),
+            parts=self,
+        )
+
+    def _check_values(self, log_likelihood: Tensor, observation: Tensor, observed: Tensor) -> None:
+        if not self.validate or torch.compiler.is_compiling() or log_likelihood.is_meta:
+            return
+        if bool(torch.isfinite(log_likelihood).all()):
+            return
+        bad = observed & ~torch.isfinite(observation)
+        if bool(bad.any()):
+            components = bad.flatten(0, -2).any(0).nonzero().flatten().tolist()
+            raise ValueError(
+                "`observation` holds NaN or inf in entries that `observed` calls arrived "
+                f"(components {components}): mark them missing, for example with "
+                "ObservedFromNaN."
+            )
+        raise ValueError(
+            "the particles are no longer finite although every observed entry is: the learned "
+            "model diverged. Lower the learning rate."
+        )
+
+
+class _Networks(NamedTuple):
+    """The model of one forward pass: weights joined by what they multiply."""
+
+    own: Tensor
+    gate_bias: Tensor
+    seen: Tensor
+    seen_bias: Tensor
+    moved: Tensor
+    moved_bias: Tensor
+    drawn: Tensor
+    parts: ParticleFilter
+
+    def share(self, seen: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        """Multiply what all particles of a row share, for all steps at once."""
+        from_seen = linear(seen, self.seen, self.seen_bias)
+        from_action = linear(action, self.moved, self.moved_bias)
+        return from_seen, from_action
+
+    def prospect(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> Prospect:
+        h, parts = self.parts.hidden_dim, self.parts
+        from_seen, from_action = (part.unsqueeze(-2) for part in inputs)
+        last = parts.emission.out_features
+        to_q, to_p, to_x, to_gates = torch.split(linear(hidden, self.own), [h, h, last, 3 * h], -1)
+        seen_q, seen_gates = torch.split(from_seen, [h, 3 * h], -1)
+        action_p, action_x = torch.split(from_action, [h, last], -1)
+        floor = parts.latent_min_std**2
+        proposal = _gaussian(parts.proposal_head((to_q + seen_q).relu()), floor)
+        transition = _gaussian(parts.transition_head((to_p + action_p).relu()), floor)
+        return Prospect(proposal, transition, (to_x + action_x, to_gates, seen_gates))
+
+    def outcome(
+        self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
+    ) -> Outcome:
+        del inputs
+        parts, h = self.parts, self.parts.hidden_dim
+        to_x, own_gates, seen_gates = context
+        embedding = parts.latent_encoder(latent)
+        from_drawn = linear(embedding, self.drawn)
+        drawn_x, drawn_gates = torch.split(from_drawn, [to_x.shape[-1], 3 * h], -1)
+        decoded = parts.decoder((to_x + drawn_x).relu())
+        emission = _gaussian(parts.emission_head(decoded), parts.min_std**2)
+        # The GRU's equations, over sums of products that are already there.
+        outer = seen_gates + drawn_gates
+        inner = own_gates + self.gate_bias
+        reset, keep = (outer[..., : 2 * h] + inner[..., : 2 * h]).sigmoid().chunk(2, -1)
+        fresh = (outer[..., 2 * h :] + reset * inner[..., 2 * h :]).tanh()
+        return Outcome(emission, fresh + keep * (hidden - fresh), embedding)
+
+
+def _gaussian(raw: Tensor, floor: float) -> DiagonalGaussian:
+    mean, spread = raw.chunk(2, -1)
+    return DiagonalGaussian(mean, softplus(spread) + floor)
+
+
+def _layers(sizes: Sequence[int], given: dict[str, Any]) -> nn.Sequential:
+    """Make linear layers, each with a ReLU behind it."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs, **given), nn.ReLU()]
+    return nn.Sequential(*layers)
