@@ -418,3 +418,19 @@ def test_a_model_that_diverged_says_so():
         model.transition.layers[-1].bias.fill_(torch.nan)
     with pytest.raises(ValueError, match="the learned model diverged"):
         model(*make_inputs(3))
+
+
+@pytest.mark.parametrize("name", ["previous_action", "mean"])
+def test_a_nan_that_comes_in_is_named_even_where_nothing_was_observed(name):
+    belief = make_filter(OBS, ACTION, None)
+    inputs = {
+        "mean": torch.zeros(3, belief.state_dim),
+        "previous_action": torch.zeros(3, belief.action_dim),
+    }
+    inputs[name][1, 0] = float("nan")
+    nothing = torch.zeros(3, belief.obs_dim, dtype=torch.bool)
+    with pytest.raises(ValueError, match=f"`{name}` holds NaN or inf"):
+        belief.step(
+            inputs["mean"], None, inputs["previous_action"], torch.zeros(3, belief.obs_dim),
+            nothing, torch.zeros(3, dtype=torch.bool),
+        )  # fmt: skip

@@ -19,7 +19,7 @@ import torch
 from env_tools import TASKS, play, random_actions
 from gymnasium import spaces
 from torchrl.collectors import Collector
-from torchrl.envs import SerialEnv, StepCounter, TransformedEnv, check_env_specs
+from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
@@ -377,8 +377,20 @@ def test_a_task_without_mujoco_says_that_it_can_not_be_saved():
     env = GymnasiumBatchEnv("Pendulum-v1", 2, seed=0)
     check_env_specs(env)
     assert not env.supports_state
-    with pytest.raises(RuntimeError, match="supports_state"):
-        env.state_dict()
+    assert not any(env.state_dict().values())
+    other = GymnasiumBatchEnv("InvertedPendulum-v5", 2, seed=0)
+    other.reset()
+    with pytest.raises(RuntimeError, match=r"can not be restored.*supports_state"):
+        env.load_state_dict(other.state_dict())
+
+
+def test_a_task_that_can_not_be_saved_runs_in_parallel_environments():
+    # TorchRL asks a shadow of each worker's environment for its state_dict.
+    env = ParallelEnv(2, lambda: GymnasiumBatchEnv("Pendulum-v1", 3, seed=0))
+    try:
+        assert env.rollout(3)["observation"].shape == (2, 3, 3, 3)
+    finally:
+        env.close(raise_if_closed=False)
 
 
 # Errors ----------------------------------------------------------------------------------------

@@ -656,10 +656,11 @@ def at_the_noise_floor(
     return single, double
 
 
+@pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
 @pytest.mark.parametrize(("state", "obs"), [(8, 27), (17, 17), (32, 11), (16, 105)], ids=str)
-def test_float32_keeps_its_digits_at_the_noise_floor(state, obs):
-    # In the form that is chosen: factorising the larger side there would lose most digits.
-    single, double = at_the_noise_floor(state, obs)
+def test_float32_keeps_its_digits_at_the_noise_floor(state, obs, full_noise):
+    # In the form that is chosen, for a full R with more sensors than states in float64 inside.
+    single, double = at_the_noise_floor(state, obs, full_noise=full_noise)
     outputs, truth = single.fast("auto"), double.fast("auto")
     mean, cov, ll = (a.detach().double() - b.detach() for a, b in zip(outputs, truth, strict=True))
     assert float(mean.abs().max()) < 1e-3
@@ -690,9 +691,10 @@ def test_float32_stays_finite_and_positive_definite_at_the_noise_floor(state, ob
         assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
 
 
+@pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
 @pytest.mark.parametrize(("state", "obs"), [(8, 27), (17, 17), (16, 105)], ids=str)
-def test_a_float32_step_keeps_its_digits_at_the_noise_floor(state, obs):
-    single, double = at_the_noise_floor(state, obs)
+def test_a_float32_step_keeps_its_digits_at_the_noise_floor(state, obs, full_noise):
+    single, double = at_the_noise_floor(state, obs, full_noise=full_noise)
     outputs = []
     for problem in (single, double):
         mean, action, x, observed, reset = problem.arguments()
@@ -706,6 +708,18 @@ def test_a_float32_step_keeps_its_digits_at_the_noise_floor(state, obs):
     assert float(cov.abs().max()) < 1e-5
     relative = ll.abs() / outputs[1].log_likelihood.detach().abs().clamp(min=10)
     assert float(relative.max()) < 1e-3
+
+
+@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("given", ["restart", "restart_mean"])
+def test_restart_and_restart_mean_come_together(form, given):
+    problem = Problem(3, 5)
+    mean, action, x, observed, reset = problem.arguments()
+    one = {"restart": reset, "restart_mean": torch.zeros(*reset.shape, 3).to(x)}[given]
+    with pytest.raises(ValueError, match="`restart` and `restart_mean` come together"):
+        filter_sequence(
+            problem.model(), mean, action, x, observed, reset, form=form, **{given: one}
+        )
 
 
 # --- autograd manners -----------------------------------------------------------------------------

@@ -678,6 +678,41 @@ def test_float32_covariances_survive_10000_iterations(state, obs, predicts):
     )
 
 
+@pytest.mark.parametrize("dead", [False, True], ids=["random masks", "a sensor dead for good"])
+@pytest.mark.parametrize(("state", "obs"), [(17, 17), (32, 8)], ids=str)
+def test_float32_updates_of_a_correlated_belief_stay_positive_definite(state, obs, dead):
+    g = torch.Generator().manual_seed(0)
+    root = torch.randn(state, state, generator=g)
+    cov = root @ root.T / state + 0.01 * torch.eye(state)
+    belief = Belief(torch.zeros(state), cov)
+    h = torch.randn(obs, state, generator=g) / state**0.5
+    r = 1e-4 * torch.eye(obs)
+    observed = torch.ones(obs, dtype=torch.bool)
+    observed[0] = False
+    smallest = []
+    for _ in range(1500):
+        if not dead:
+            observed = torch.rand(obs, generator=g) < 0.5
+        belief = F.update(belief, torch.randn(obs, generator=g), observed, h, r)
+        smallest.append(torch.linalg.eigvalsh(belief.cov.double())[0])
+    assert float(torch.stack(smallest).min()) > 0
+
+
+@pytest.mark.parametrize("std", [0.3, 3.0])
+def test_a_float32_covariance_is_not_inflated(std):
+    # A large prior beside a small R: the safeguard against rounding must not show.
+    g = torch.Generator().manual_seed(0)
+    h = 5.0 * torch.linalg.qr(torch.randn(17, 17, generator=g))[0]
+    belief = Belief(torch.zeros(17), std**2 * torch.eye(17))
+    seen = torch.ones(17, dtype=torch.bool)
+    single = F.update(belief, torch.zeros(17), seen, h, 1e-4 * torch.eye(17)).cov
+    wide = Belief(belief.mean.double(), belief.cov.double())
+    zeros = torch.zeros(17, dtype=torch.float64)
+    r = (1e-4 * torch.eye(17)).double()
+    double = F.update(wide, zeros, seen, h.double(), r).cov
+    torch.testing.assert_close(single.diagonal().double(), double.diagonal(), rtol=1e-5, atol=0)
+
+
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_float32_is_near_float64(state, obs):
     system, belief, x, offset, g = case(state, obs)

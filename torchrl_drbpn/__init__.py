@@ -5,6 +5,7 @@ from importlib.metadata import PackageNotFoundError, version
 from torchrl_drbpn import functional
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 from torchrl_drbpn.modules import (
+    BeliefDivergedError,
     BeliefFilter,
     BeliefFilterModule,
     GaussianTransition,
@@ -32,6 +33,7 @@ except PackageNotFoundError:  # a checkout that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
+    "BeliefDivergedError",
     "BeliefFilter",
     "BeliefFilterModule",
     "BeliefModelLoss",

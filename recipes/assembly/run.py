@@ -14,6 +14,7 @@ from torchrl.record.loggers.common import Logger
 
 from assembly.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from assembly.console import ProgressBar, say
+from assembly.errors import UserError
 from assembly.evaluation import Episodes, evaluate, make_evaluation_environment
 from assembly.interruption import StopRequest
 from assembly.run_folder import Table, write_config, write_versions
@@ -26,6 +27,7 @@ from assembly.training import (
     train_rollout,
     training_state,
 )
+from torchrl_drbpn import BeliefDivergedError
 
 EVALUATION_COLUMNS = (
     "frames",
@@ -137,7 +139,13 @@ class _Run:
     def _timed_rollout(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         progress = self.training.progress
         before = progress.frames
-        row, finished = train_rollout(self.training, self.settings)
+        try:
+            row, finished = train_rollout(self.training, self.settings)
+        except (BeliefDivergedError, torch.linalg.LinAlgError) as error:
+            raise UserError(
+                f"training diverged at {before:,} steps: {error} The last checkpoint is in "
+                f"{self.folder}; a lower optim.lr starts anew."
+            ) from error
         # Logging and saving since the last update count; evaluation has moved the clock on.
         now = time.perf_counter()
         seconds, self.clock = now - self.clock, now

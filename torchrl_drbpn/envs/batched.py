@@ -239,30 +239,27 @@ class BatchedSimulators(EnvBase):
         return False
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Refuse: there is no state to save; ``state_dict()`` calls it.
+        """Return nothing: there is no state to save; ``state_dict()`` calls it.
 
-        Raises:
-            RuntimeError: always, unless a backend overrides it.
+        It does not raise, since TorchRL asks a shadow of every environment of a ``ParallelEnv``
+        for its ``state_dict()``. Who saves a run looks at :attr:`supports_state`.
         """
-        raise RuntimeError(
-            f"the state of `{self.env_id}` can not be saved: {self._why_no_state()}. Look at "
-            "`supports_state` and start new episodes instead."
-        )
+        return {}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Refuse: there is no state to restore; ``load_state_dict`` calls it.
+        """Refuse a state: it can not be restored; ``load_state_dict`` calls it.
 
         Args:
-            state: what another environment saved.
+            state: what another environment saved; empty where it could not be saved either.
 
         Raises:
-            RuntimeError: always, unless a backend overrides it.
+            RuntimeError: where there is a state, unless a backend overrides it.
         """
-        del state
-        raise RuntimeError(
-            f"the state of `{self.env_id}` can not be restored: {self._why_no_state()}. Look at "
-            "`supports_state` and start new episodes instead."
-        )
+        if state:
+            raise RuntimeError(
+                f"the state of `{self.env_id}` can not be restored: {self._why_no_state()}. Look "
+                "at `supports_state` and start new episodes instead."
+            )
 
     def _why_no_state(self) -> str:
         return f"`{type(self).__name__}` has no access to it"

@@ -40,8 +40,8 @@ class EnvPoolBatchEnv(BatchedSimulators):
     - The seeds of EnvPool are fixed where the simulators are made. ``set_seed`` therefore makes
       them anew at the next reset, and every row has to be reset before the next step.
     - A terminated row can not be stepped on: EnvPool would start the next episode unasked.
-    - The state can not be saved: :attr:`supports_state` is False, ``state_dict()`` raises, and the
-      caller has to start new episodes. A copy or a pickle starts new episodes too.
+    - The state can not be saved: :attr:`supports_state` is False, ``state_dict()`` is empty, and
+      the caller has to start new episodes. A copy or a pickle starts new episodes too.
     - There is no rendering, and there are no keyword arguments for the task.
 
     Args:

@@ -41,7 +41,7 @@ class GymnasiumBatchEnv(BatchedSimulators):
     its seed, once; later resets go on from there.
 
     Saving: ``state_dict()`` holds the whole state of MuJoCo environments, and a run that goes on
-    from it is the same to the last bit. Where :attr:`supports_state` is False it raises, and the
+    from it is the same to the last bit. Where :attr:`supports_state` is False it is empty, and the
     caller has to start new episodes.
 
     Args:
@@ -171,10 +171,8 @@ class GymnasiumBatchEnv(BatchedSimulators):
         Returns:
             ``simulators`` (see below), ``elapsed`` int64 ``(num_envs,)`` steps since the reset,
             ``seeds`` int64 ``(num_envs,)`` seeds that the next reset uses (-1: none), ``started``
-            bool ``(num_envs,)``, and ``observation`` float64 ``(num_envs, obs)``.
-
-        Raises:
-            RuntimeError: where :attr:`supports_state` is False.
+            bool ``(num_envs,)``, and ``observation`` float64 ``(num_envs, obs)``. Empty where
+            :attr:`supports_state` is False.
         """
         if not self.supports_state:
             return super().get_extra_state()
@@ -195,10 +193,11 @@ class GymnasiumBatchEnv(BatchedSimulators):
         Raises:
             ValueError: where the state is of another environment, another number of
                 environments, or incomplete.
-            RuntimeError: where :attr:`supports_state` is False.
+            RuntimeError: for a state where :attr:`supports_state` is False.
         """
         if not self.supports_state:
-            super().set_extra_state(state)  # raises
+            super().set_extra_state(state)
+            return
         shapes = {
             "elapsed": (self.num_envs,),
             "seeds": (self.num_envs,),

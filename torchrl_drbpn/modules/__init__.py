@@ -1,6 +1,6 @@
 """The learned state-space model, the belief filter, and its TensorDictModule."""
 
-from torchrl_drbpn.modules.belief_filter import BeliefFilter
+from torchrl_drbpn.modules.belief_filter import BeliefDivergedError, BeliefFilter
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.export import PolicyStep
 from torchrl_drbpn.modules.particle_filter import ParticleFilterModule
@@ -8,6 +8,7 @@ from torchrl_drbpn.modules.particle_model import ParticleFilter
 from torchrl_drbpn.modules.state_space import GaussianTransition, LinearGaussianEmission
 
 __all__ = [
+    "BeliefDivergedError",
     "BeliefFilter",
     "BeliefFilterModule",
     "GaussianTransition",

@@ -25,9 +25,18 @@ from torchrl_drbpn.modules.state_space import (
     initial_covariance,
 )
 
-__all__ = ["BeliefFilter"]
+__all__ = ["BeliefDivergedError", "BeliefFilter"]
 
 _MAX_DEFAULT_STATE = 32
+
+
+class BeliefDivergedError(ValueError):
+    """Say that the learned model left the range of its numbers; the input was sound.
+
+    Example:
+        >>> issubclass(BeliefDivergedError, ValueError)
+        True
+    """
 
 
 class BeliefFilter(nn.Module):
@@ -351,7 +360,7 @@ class BeliefFilter(nn.Module):
                     f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "
                     "by a policy or a filter that had diverged?"
                 )
-        raise ValueError(
+        raise BeliefDivergedError(
             "the belief is no longer finite although every observed entry is: the learned model "
             "diverged. Lower the learning rate, or use residual=False where state > obs."
         )

@@ -20,6 +20,7 @@ from torchrl_drbpn.functional import (
     zero_missing,
 )
 from torchrl_drbpn.functional.gaussian import check_observed
+from torchrl_drbpn.modules.belief_filter import BeliefDivergedError
 
 __all__ = ["ParticleFilter"]
 
@@ -336,7 +337,7 @@ class ParticleFilter(nn.Module):
                 f"(components {components}): mark them missing, for example with "
                 "ObservedFromNaN."
             )
-        raise ValueError(
+        raise BeliefDivergedError(
             "the particles are no longer finite although every observed entry is: the learned "
             "model diverged. Lower the learning rate."
         )
