@@ -1,0 +1,532 @@
+"""Duties of every belief module; see contracts.py."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from contract_environments import ACTION, OBS, StaircaseEnv, parallel_env, saved
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import (
+    Compose,
+    DoubleToFloat,
+    DTypeCastTransform,
+    EnvBase,
+    GymEnv,
+    InitTracker,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs
+from torchrl.modules import set_recurrent_mode
+from torchrl.modules.utils import get_primers_from_module
+
+from torchrl_drbpn import GymnasiumBatchEnv, ObservationMissingness, PreviousAction
+
+
+def belief_env(primer: Transform | None = None, name: str = "InvertedPendulum-v5") -> EnvBase:
+    """Return an environment that writes what every belief module reads, batch size ()."""
+    env = TransformedEnv(GymEnv(name), Compose())
+    return with_belief_entries(env, primer)
+
+
+def actions_in_float64() -> Transform:
+    """Return the transform that lets a float64 policy act in a simulator of float32 actions."""
+    return DTypeCastTransform(torch.float32, torch.float64, in_keys=[], in_keys_inv=["action"])
+
+
+def with_belief_entries(
+    env: TransformedEnv, primer: Transform | None = None, *, to_float32: bool = True
+) -> TransformedEnv:
+    """Append what every belief module reads; half of the entries are missing.
+
+    In float64 the actions are float64 too, as the policy's are.
+    """
+    for transform in (
+        DoubleToFloat() if to_float32 else actions_in_float64(),
+        PreviousAction(),
+        ObservationMissingness("mcar", 0.5, always_observed=0.0),
+        InitTracker(),
+        primer,
+    ):
+        if transform is not None:
+            env.append_transform(transform)
+    return env
+
+
+class BeliefModuleContract:
+    """Duties of a belief module: what `GRUModule` does in a TorchRL pipeline, and the age rule.
+
+    `is_init & (age == 0)` starts from the module's own beginning; `is_init` with an older age takes
+    the stored state; without `is_init` the state is carried on.
+
+    Attributes:
+        age_key: the root entry that counts updates since the reset.
+        tolerance32: how far one step at a time and whole sequences may differ in float32, as a
+            share of the largest entry.
+        tolerance64: the same in float64.
+    """
+
+    age_key: Any = ("recurrent", "age")
+    tolerance32: float = 1e-5
+    tolerance64: float = 1e-10
+
+    # --- hooks
+    def make_module(
+        self, obs: int = OBS, action: int = ACTION, dtype: torch.dtype | None = None, **kwargs: Any
+    ) -> TensorDictModuleBase:
+        """Return a module, equal to every other made with the same arguments."""
+        raise NotImplementedError
+
+    def differentiable(self, out: TensorDictBase) -> torch.Tensor:
+        """Return a number that depends on everything the module learns from."""
+        return out["features"].square().mean()
+
+    # --- helpers
+    def make_frames(
+        self, shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0
+    ) -> TensorDict:
+        """Return what the environment writes, nowhere an episode start."""
+        g = torch.Generator().manual_seed(seed)
+        observed = torch.rand(*shape, OBS, generator=g) < 0.6
+        observation = torch.randn(*shape, OBS, generator=g, dtype=dtype)
+        return TensorDict(
+            {
+                "observation": torch.where(observed, observation, 0.0),
+                "observed": observed,
+                "previous_action": torch.randn(*shape, ACTION, generator=g, dtype=dtype),
+                "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
+            },
+            shape,
+        )
+
+    def state_keys(self, module: TensorDictModuleBase) -> list[Any]:
+        return list(module.make_tensordict_primer().primers.keys(True, True))
+
+    def some_state(
+        self, module: TensorDictModuleBase, shape: tuple[int, ...], seed: int = 1
+    ) -> TensorDict:
+        """Return a recurrent state in mid-episode: what the module wrote after two steps."""
+        dtype = next(module.parameters()).dtype
+        frames = self.make_frames((*shape, 2), dtype, seed)
+        frames["is_init"][..., 0, :] = True
+        with torch.no_grad():
+            return self.one_by_one(module, frames, None)["next"][..., -1].select(
+                *self.state_keys(module)
+            )
+
+    def one_by_one(
+        self, module: TensorDictModuleBase, frames: TensorDict, start: TensorDict | None
+    ) -> TensorDict:
+        """Run step by step as a collector does; the primer's zeros where an episode starts.
+
+        The result holds the stored state at every step, as a collected rollout does.
+        """
+        keys = self.state_keys(module)
+        primers = module.make_tensordict_primer().primers
+        batch = frames.shape[:-1]
+        zeros = TensorDict({k: primers[k].expand(*batch, *primers[k].shape).zero() for k in keys})
+        carried = zeros if start is None else start
+        steps = []
+        for t in range(frames.shape[-1]):
+            step = frames[..., t].clone()
+            for key in keys:
+                first = step["is_init"].reshape(*batch, *([1] * (primers[key].ndim)))
+                step.set(key, torch.where(first, zeros[key], carried[key]))
+            with set_recurrent_mode(False):
+                module(step)
+            carried = step["next"]
+            steps.append(step)
+        return torch.stack(steps, len(batch))
+
+    def as_sequence(self, module: TensorDictModuleBase, rollout: TensorDict) -> TensorDict:
+        """Run over time from what a rollout stores, with what the module wrote left out."""
+        keys = ["observation", "observed", "previous_action", "is_init"]
+        with set_recurrent_mode(True):
+            return module(rollout.select(*keys, *self.state_keys(module)))
+
+    def written(self, module: TensorDictModuleBase) -> list[Any]:
+        return [k for k in module.out_keys if not (isinstance(k, tuple) and k[0] == "next")]
+
+    def assert_same(
+        self, module: TensorDictModuleBase, received: TensorDictBase, expected: TensorDictBase
+    ) -> None:
+        for key in self.written(module):
+            dtype = expected[key].dtype
+            limit = self.tolerance64 if dtype == torch.float64 else self.tolerance32
+            # The largest entry sets the scale: beliefs of raw sensors may be far from 1.
+            scale = max(1.0, expected[key].abs().max().item())
+            torch.testing.assert_close(
+                received[key],
+                expected[key],
+                rtol=limit,
+                atol=limit * scale,
+                msg=lambda text, key=key: f"{key}: {text}",
+            )
+
+    # --- keys
+    def test_every_out_key_is_written_and_no_other(self):
+        module = self.make_module()
+        rollout = self.one_by_one(module, self.make_frames((3, 4)), None)
+        assert set(rollout.keys(True, True)) == {*module.in_keys, *module.out_keys}
+        sequence = self.as_sequence(module, rollout)
+        assert set(sequence.keys(True, True)) == {*module.in_keys, *module.out_keys}
+        for key in module.out_keys:
+            assert sequence[key].shape == rollout[key].shape, key
+            assert sequence[key].dtype == rollout[key].dtype, key
+
+    def test_keys_can_be_renamed_nested_ones_included(self):
+        plain = self.make_module()
+        named = self.make_module(
+            in_keys={"observation": ("agent", "observation"), "is_init": "first"},
+            out_keys={"features": ("agent", "embed")},
+        )
+        frames = self.make_frames((3, 4))
+        frames["is_init"][:, 0] = True
+        with set_recurrent_mode(True):
+            expected = plain(frames.clone())["features"]
+            renamed = frames.clone()
+            renamed.rename_key_("observation", ("agent", "observation"))
+            renamed.rename_key_("is_init", "first")
+            received = named(renamed)
+        assert torch.equal(received["agent", "embed"], expected)
+        assert "features" not in received
+
+    def test_dispatch_takes_tensors_by_name(self):
+        module = self.make_module()
+        rollout = self.one_by_one(module, self.make_frames((3, 4)), None)
+        step = rollout[:, 1].select(*module.in_keys)
+        expected = module(step.clone())
+        kwargs = {k if isinstance(k, str) else "_".join(k): step[k] for k in module.in_keys}
+        received = dict(zip(module.out_keys, module(**kwargs), strict=True))
+        for key in module.out_keys:
+            assert torch.equal(received[key], expected[key]), key
+
+    # --- shapes, steps, sequences
+    @pytest.mark.parametrize("shape", [(), (2,), (2, 3)])
+    def test_one_step_takes_any_batch_shape(self, shape):
+        module = self.make_module()
+        start = self.some_state(module, (6,))
+        frames = self.make_frames((6, 1))
+        each = self.one_by_one(module, frames, start)[:, 0]
+        count = torch.Size(shape).numel()
+        step = each.select(*module.in_keys)[:count].reshape(shape)
+        out = module(step)
+        assert out.batch_size == torch.Size(shape)
+        self.assert_same(module, out.reshape(-1), each[:count])
+
+    @pytest.mark.parametrize("shape", [(), (2,), (2, 3), (2, 3, 2)])
+    def test_a_sequence_takes_any_number_of_leading_dimensions(self, shape):
+        module = self.make_module()
+        count = torch.Size(shape).numel()
+        frames = self.make_frames((count, 5))
+        frames["is_init"][:, 0] = True
+        rollout = self.one_by_one(module, frames, None)
+        out = self.as_sequence(module, rollout.reshape(*shape, 5))
+        assert out.batch_size == (*shape, 5)
+        self.assert_same(module, out.reshape(count, 5), rollout)
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("start", ["episode start", "mid-episode"])
+    def test_step_by_step_equals_the_whole_sequence(self, dtype, start):
+        module = self.make_module(dtype=dtype)
+        frames = self.make_frames((4, 12), dtype)
+        frames["is_init"][1, 5] = True
+        frames["is_init"][2, [3, 4, 9]] = True
+        if start == "episode start":
+            frames["is_init"][:, 0] = True
+        state = None if start == "episode start" else self.some_state(module, (4,))
+        rollout = self.one_by_one(module, frames, state)
+        assert rollout["features"].dtype == dtype
+        self.assert_same(module, self.as_sequence(module, rollout), rollout)
+
+    def test_a_reset_inside_a_row_equals_two_sequences(self):
+        module = self.make_module(dtype=torch.float64)
+        frames = self.make_frames((2, 9), torch.float64)
+        frames["is_init"][:, [0, 4]] = True
+        whole = self.as_sequence(module, self.one_by_one(module, frames, None))
+        parts = [
+            self.as_sequence(module, self.one_by_one(module, part, None))
+            for part in (frames[:, :4], frames[:, 4:])
+        ]
+        self.assert_same(module, whole, torch.cat(parts, 1))
+
+    def test_a_row_goes_on_from_the_state_stored_at_its_first_step(self):
+        module = self.make_module(dtype=torch.float64)
+        frames = self.make_frames((2, 9), torch.float64)
+        frames["is_init"][:, 0] = True
+        rollout = self.one_by_one(module, frames, None)
+        cut = self.as_sequence(module, rollout[:, 5:])
+        self.assert_same(module, cut, rollout[:, 5:])
+        # and the state matters: another one gives another belief
+        other = rollout[:, 5:].clone()
+        for key in self.state_keys(module):
+            if other[key].is_floating_point():
+                other[key] += 1.0
+        assert not torch.allclose(
+            self.as_sequence(module, other)["features"][:, 0], rollout["features"][:, 5]
+        )
+
+    def test_is_init_with_an_older_age_loads_the_stored_state(self):
+        # two slices of one episode in one row, as TorchRL's SliceSampler lays them out
+        module = self.make_module(dtype=torch.float64)
+        frames = self.make_frames((2, 12), torch.float64)
+        frames["is_init"][:, 0] = True
+        rollout = self.one_by_one(module, frames, None)
+        slices = [rollout[:, 2:5].clone(), rollout[:, 8:12].clone()]
+        for piece in slices:
+            piece["is_init"][:, 0] = True
+        stitched = torch.cat(slices, 1)
+        expected = torch.cat([rollout[:, 2:5], rollout[:, 8:12]], 1)
+        assert (stitched[self.age_key][:, [0, 3]] > 0).all()
+        self.assert_same(module, self.as_sequence(module, stitched), expected)
+        self.assert_same(module, module(stitched.select(*module.in_keys)), expected)
+
+    def test_an_episode_start_ignores_whatever_state_is_stored(self):
+        module = self.make_module()
+        frames = self.make_frames((3, 4))
+        frames["is_init"][:, [0, 2]] = True
+        rollout = self.one_by_one(module, frames, None)
+        dirty = rollout.clone()
+        for key in self.state_keys(module):
+            if dirty[key].is_floating_point():
+                dirty[key][:, [0, 2]] = 7.0
+        self.assert_same(module, self.as_sequence(module, dirty), rollout)
+        self.assert_same(module, module(dirty.select(*module.in_keys)), rollout)
+
+    def test_the_age_counts_updates_since_the_reset(self):
+        module = self.make_module()
+        frames = self.make_frames((1, 6))
+        frames["is_init"][:, [0, 4]] = True
+        rollout = self.one_by_one(module, frames, None)
+        assert rollout[self.age_key].flatten().tolist() == [0, 1, 2, 3, 0, 1]
+        following = rollout["next"][self.age_key].flatten()
+        assert following.tolist() == [1, 2, 3, 4, 1, 2]
+        # without stored entries a sequence counts for itself
+        with set_recurrent_mode(True):
+            fresh = module(frames.clone())
+        assert torch.equal(fresh["next"][self.age_key].flatten(), following)
+
+    def test_sequences_without_recurrent_entries_begin_at_the_beginning(self):
+        module = self.make_module()
+        frames = self.make_frames((3, 6))
+        frames["is_init"][1, 3] = True
+        with set_recurrent_mode(True), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            received = module(frames.clone())
+        frames["is_init"][:, 0] = True
+        self.assert_same(module, received, self.one_by_one(module, frames, None))
+
+    def test_single_steps_without_recurrent_entries_warn_once(self):
+        module = self.make_module()
+        step = self.make_frames((3,))
+        with pytest.warns(UserWarning, match=r"make_tensordict_primer\(\)"):
+            received = module(step.clone())
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            module(step.clone())
+        step["is_init"][:] = True
+        expected = self.one_by_one(module, step.unsqueeze(-1), None)[:, 0]
+        self.assert_same(module, received, expected)
+
+    def test_non_contiguous_input_gives_the_same(self):
+        module = self.make_module()
+        frames = self.make_frames((3, 6))
+        frames["is_init"][:, 0] = True
+        rollout = self.one_by_one(module, frames, None)
+        strided = rollout.transpose(0, 1).contiguous().transpose(0, 1)
+        assert not strided["observation"].is_contiguous()
+        self.assert_same(module, self.as_sequence(module, strided), rollout)
+
+    def test_what_was_read_is_left_as_it_was(self):
+        module = self.make_module()
+        frames = self.make_frames((3, 6))
+        rollout = self.one_by_one(module, frames, self.some_state(module, (3,)))
+        before = rollout.select(*module.in_keys).clone()
+        after = self.as_sequence(module, rollout)
+        for key in module.in_keys:
+            assert torch.equal(after[key], before[key]), key
+
+    # --- modes
+    def test_the_mode_is_a_context_or_a_default(self):
+        module = self.make_module(default_recurrent_mode=True)
+        plain = self.make_module()
+        frames = self.make_frames((3, 6))
+        frames["is_init"][:, 0] = True
+        rollout = self.one_by_one(plain, frames, None)
+        # over time and step by step agree only if the first really ran over time
+        dirty = rollout.select(*module.in_keys)
+        for key in self.state_keys(module):
+            if dirty[key].is_floating_point():
+                dirty[key][:, 1:] = 7.0
+        self.assert_same(module, module(dirty.clone()), rollout)
+        with set_recurrent_mode(False):
+            single = module(dirty.clone())["features"]
+        assert not torch.allclose(single[:, 1:], rollout["features"][:, 1:])
+        assert torch.equal(plain(dirty.clone())["features"], single)
+
+    # --- TorchRL's machinery
+    def test_its_primer_is_found_inside_a_sequence(self):
+        module = self.make_module()
+        head = TensorDictModule(nn.LazyLinear(ACTION), ["features"], ["action"])
+        policy = TensorDictSequential(module, head)
+        primer = get_primers_from_module(policy)
+        assert set(primer.primers.keys(True, True)) == set(self.state_keys(module))
+        for key in self.state_keys(module):
+            assert ("next", *key) in module.out_keys
+        env = with_belief_entries(TransformedEnv(StaircaseEnv(), Compose()), primer)
+        check_env_specs(env)
+        data = env.rollout(8, policy, break_when_any_done=False)
+        assert data["next", "done"].any()
+        self.check_collected(module, data)
+
+    def check_collected(self, module: TensorDictModuleBase, data: TensorDictBase) -> None:
+        """Assert that a rollout's beliefs are those of its frames, run over time."""
+        age = torch.zeros_like(data[self.age_key][..., 0, :])
+        for t in range(data.shape[-1]):
+            started = data["is_init"][..., t, :] | (t == 0)
+            stored = data[self.age_key][..., t, :]
+            age = torch.where(started, stored if t == 0 else torch.zeros_like(age), age)
+            assert torch.equal(stored, age)
+            age = age + 1
+        self.assert_same(module, self.as_sequence(module, data), data)
+
+    def make_policy(self, module: TensorDictModuleBase, actions: int) -> TensorDictSequential:
+        head = TensorDictModule(nn.LazyLinear(actions), ["features"], ["action"])
+        return TensorDictSequential(module, head)
+
+    def test_the_collector_registers_its_primer(self):
+        module = self.make_module()
+        collector = Collector(
+            with_belief_entries(TransformedEnv(StaircaseEnv(), Compose())),
+            self.make_policy(module, ACTION),
+            frames_per_batch=24,
+            total_frames=72,
+            auto_register_policy_transforms=True,
+        )
+        try:
+            batches = list(collector)
+        finally:
+            collector.shutdown()
+        assert any(batch["next", "done"].any() for batch in batches)
+        assert (batches[1][self.age_key][:, 0] > 0).any()  # a row that starts in mid-episode
+        for batch in batches:
+            self.check_collected(module, batch)
+
+    @pytest.mark.parametrize("kind", ["serial", "parallel", "gymnasium"])
+    def test_it_runs_in_batched_environments(self, kind):
+        module = self.make_module(4, 1)
+        primer = module.make_tensordict_primer
+        if kind == "gymnasium":
+            base = TransformedEnv(GymnasiumBatchEnv("InvertedPendulum-v5", 2), Compose())
+            env = with_belief_entries(base, primer())
+        elif kind == "serial":
+            env = SerialEnv(2, lambda: belief_env(primer()))
+        else:
+            env = parallel_env(2, partial(belief_env, primer()))
+        try:
+            env.set_seed(0)
+            with torch.no_grad():
+                data = env.rollout(
+                    40, self.make_policy(module, 1), break_when_any_done=False
+                ).contiguous()
+        finally:
+            env.close(raise_if_closed=False)
+        assert data["is_init"][:, 1:].any()
+        self.check_collected(module, data)
+
+    @pytest.mark.parametrize("over_time", [False, True])
+    def test_compiled_without_a_graph_break_equals_eager(self, over_time):
+        module = self.make_module()
+        frames = self.make_frames((3, 4))
+        frames["is_init"][1, 2] = True
+        rollout = self.one_by_one(module, frames, self.some_state(module, (3,)))
+        data = rollout.select(*module.in_keys).detach()
+        parameters = list(module.parameters())
+        torch._dynamo.reset()
+        compiled = torch.compile(module, fullgraph=True, backend="aot_eager")
+        with set_recurrent_mode(over_time):
+            expected, received = module(data.clone()), compiled(data.clone())
+        self.assert_same(module, received, expected)
+        for one, other in zip(
+            torch.autograd.grad(self.differentiable(expected), parameters, allow_unused=True),
+            torch.autograd.grad(self.differentiable(received), parameters, allow_unused=True),
+            strict=True,
+        ):
+            assert (one is None) == (other is None)
+            if one is not None:
+                torch.testing.assert_close(other, one)
+
+    def test_a_single_step_policy_can_be_exported(self):
+        module = self.make_module()
+        policy = self.make_policy(module, ACTION)
+        out_keys = ["action", *[("next", *key) for key in self.state_keys(module)]]
+        step = self.one_by_one(module, self.make_frames((3, 2)), None)[:, 1]
+        step = step.select(*module.in_keys).detach()
+        policy(step.clone())
+        policy.select_out_keys(*out_keys)
+        kwargs = {k if isinstance(k, str) else "_".join(k): step[k] for k in module.in_keys}
+        expected = policy(**kwargs)
+        exported = torch.export.export(policy, args=(), kwargs=kwargs, strict=False)
+        for one, other in zip(exported.module()(**kwargs), expected, strict=True):
+            torch.testing.assert_close(one, other)
+
+    # --- parameters
+    def test_the_state_survives_a_file(self):
+        first, second = self.make_module(), self.make_module()
+        with torch.no_grad():
+            for parameter in first.parameters():
+                parameter += 0.05
+        second.load_state_dict(saved(first.state_dict()))
+        frames = self.make_frames((3, 4))
+        with set_recurrent_mode(True):
+            expected, received = first(frames.clone()), second(frames.clone())
+        assert torch.equal(received["features"], expected["features"])
+
+    def test_a_deepcopy_computes_the_same_and_shares_nothing(self):
+        first = self.make_module()
+        second = copy.deepcopy(first)
+        frames = self.make_frames((3, 4))
+        with set_recurrent_mode(True):
+            expected = first(frames.clone())["features"].clone()
+            with torch.no_grad():
+                for parameter in first.parameters():
+                    parameter.zero_()
+            assert torch.equal(second(frames.clone())["features"], expected)
+
+    def test_every_parameter_gets_a_finite_gradient_over_time(self):
+        module = self.make_module()
+        frames = self.make_frames((3, 6))
+        frames["is_init"][:, 0] = True
+        with set_recurrent_mode(True):
+            out = module(frames)
+        self.differentiable(out).backward()
+        for name, parameter in module.named_parameters():
+            assert parameter.grad is not None, name
+            assert parameter.grad.isfinite().all(), name
+            assert parameter.grad.any(), name
+
+    @pytest.mark.gpu
+    @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    def test_it_moves_to_a_gpu(self):
+        module = self.make_module()
+        frames = self.make_frames((3, 6))
+        frames["is_init"][:, 0] = True
+        with set_recurrent_mode(True):
+            expected = module(frames.clone())
+            module = module.to("cuda")
+            received = module(frames.to("cuda"))
+        self.differentiable(received).backward()
+        for spec in module.make_tensordict_primer().primers.values(True, True):
+            assert spec.device.type == "cuda"
+        for key in self.written(module):
+            assert received[key].device.type == "cuda"
+            torch.testing.assert_close(received[key].cpu(), expected[key], rtol=1e-3, atol=1e-4)

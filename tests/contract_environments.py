@@ -1,0 +1,106 @@
+"""Environments and helpers that the contracts share; see contracts.py."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import (
+    Bounded,
+    Categorical,
+    Composite,
+    TensorDictReplayBuffer,
+    Unbounded,
+)
+from torchrl.envs import (
+    DoubleToFloat,
+    EnvBase,
+    GymEnv,
+    ParallelEnv,
+    TransformedEnv,
+)
+
+OBS, ACTION = 5, 2
+
+
+class StaircaseEnv(EnvBase):
+    """A batched environment whose observation is known: 100 b + t + i/10 in row b, component i.
+
+    Row b terminates at step `horizon + b`, so that the rows of a batch are reset at different
+    times. The reward is 1 a step. Actions change nothing.
+    """
+
+    def __init__(
+        self, batch: int = 3, horizon: int = 3, obs: int = OBS, dtype: torch.dtype = torch.float32
+    ) -> None:
+        super().__init__(batch_size=[batch], device="cpu")
+        shape = (batch,)
+        self.observation_spec = Composite(
+            observation=Bounded(-1e4, 1e4, shape=(*shape, obs), dtype=dtype), shape=shape
+        )
+        self.action_spec = Unbounded(shape=(*shape, ACTION), dtype=dtype)
+        self.reward_spec = Unbounded(shape=(*shape, 1))
+        done = Categorical(2, shape=(*shape, 1), dtype=torch.bool)
+        self.done_spec = Composite(done=done, terminated=done.clone(), shape=shape)
+        self.last = horizon + torch.arange(batch)
+        self.time = torch.zeros(batch, dtype=torch.int64)
+        self.ramp = torch.arange(obs, dtype=dtype) / 10 + 100.0 * torch.arange(batch)[:, None]
+
+    def _observe(self) -> TensorDict:
+        observation = self.ramp + self.time[:, None]
+        done = (self.time >= self.last)[:, None]
+        return TensorDict(
+            {
+                "observation": observation.to(self.ramp.dtype),
+                "done": done,
+                "terminated": done.clone(),
+            },
+            self.batch_size,
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        del kwargs
+        rows = None if tensordict is None else tensordict.get("_reset", None)
+        if rows is None:
+            self.time = torch.zeros_like(self.time)
+        else:
+            self.time = self.time.masked_fill(rows.reshape(-1), 0)
+        return self._observe()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        del tensordict
+        self.time = self.time + 1
+        return self._observe().set("reward", torch.ones(*self.batch_size, 1))
+
+    def _set_seed(self, seed: int | None) -> None:
+        del seed
+
+
+def gym_env(name: str = "InvertedPendulum-v5") -> EnvBase:
+    """Return a Gymnasium environment in float32, one process, batch size ()."""
+    return TransformedEnv(GymEnv(name), DoubleToFloat())
+
+
+def parallel_env(workers: int, factory: Any) -> ParallelEnv:
+    """Return a ParallelEnv whose processes start quickly; `factory` must be picklable."""
+    return ParallelEnv(workers, factory, mp_start_method="fork")
+
+
+def with_transform(make_env: Any, make_transform: Any) -> EnvBase:
+    """Return `make_env()` with `make_transform()` appended."""
+    return make_env().append_transform(make_transform())
+
+
+def extend_and_sample(buffer: TensorDictReplayBuffer, data: TensorDictBase) -> None:
+    buffer.extend(data)
+    buffer.sample()
+
+
+def saved(state: Any) -> Any:
+    """Return `state` after a trip through a file that is read without running code."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=True)

@@ -1,0 +1,169 @@
+"""Duties of every loss; see contracts.py."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from contract_environments import saved
+from tensordict import TensorDict, TensorDictBase
+from torchrl.objectives.common import LossModule
+
+
+class LossContract:
+    """Duties of a loss: what a TorchRL LossModule promises.
+
+    Attributes:
+        has_networks: whether the loss holds parameters.
+        reductions: the values of `reduction` that the constructor takes; empty where the held
+            losses decide.
+    """
+
+    has_networks: bool = True
+    reductions: tuple[str, ...] = ()
+
+    # --- hooks
+    def make_loss(self, **kwargs: Any) -> LossModule:
+        """Return a loss, equal to every other that this method returns."""
+        raise NotImplementedError
+
+    def make_loss_data(self, dtype: torch.dtype = torch.float32) -> TensorDict:
+        """Return a minibatch, `[batch, time]`."""
+        raise NotImplementedError
+
+    # --- helpers
+    def _total(self, out: TensorDictBase) -> torch.Tensor:
+        terms = [v for k, v in out.items() if isinstance(k, str) and k.startswith("loss")]
+        assert terms
+        return torch.stack([term.sum() for term in terms]).sum()
+
+    def _assert_equal(self, received: TensorDictBase, expected: TensorDictBase) -> None:
+        assert set(received.keys(True, True)) == set(expected.keys(True, True))
+        for key in expected.keys(True, True):
+            torch.testing.assert_close(received[key], expected[key])
+
+    # --- keys
+    def test_an_unknown_key_is_refused(self):
+        with pytest.raises(ValueError, match="unknown_key"):
+            self.make_loss().set_keys(unknown_key="other")
+
+    def test_every_key_can_be_renamed_and_restored(self):
+        defaults = self.make_loss().default_keys()
+        names = list(vars(defaults))
+        for name in names:
+            loss = self.make_loss()
+            loss.set_keys(**{name: "renamed"})
+            assert getattr(loss.tensor_keys, name) == "renamed"
+            for other in names:
+                if other != name:
+                    assert getattr(loss.tensor_keys, other) == getattr(defaults, other)
+            loss.set_keys(**{name: None})
+            assert getattr(loss.tensor_keys, name) == getattr(defaults, name)
+        loss = self.make_loss()
+        loss.set_keys(**dict.fromkeys(names, "renamed"))
+        assert all(getattr(loss.tensor_keys, name) == "renamed" for name in names)
+
+    def test_in_keys_are_all_that_is_read(self):
+        loss, data = self.make_loss(), self.make_loss_data()
+        self._assert_equal(loss(data.select(*loss.in_keys, strict=False)), loss(data))
+
+    def test_out_keys_are_written_and_hold_every_term_to_be_summed(self):
+        loss = self.make_loss()
+        written = set(loss(self.make_loss_data()).keys(True, True))
+        assert set(loss.out_keys) <= written
+        assert {key for key in written if key.startswith("loss")} <= set(loss.out_keys)
+
+    def test_dispatch_takes_tensors_by_name(self):
+        loss, data = self.make_loss(), self.make_loss_data()
+        expected = loss(data)
+        kwargs = {}
+        for key in loss.in_keys:
+            value = data.get(key, None)
+            if value is not None:
+                kwargs[key if isinstance(key, str) else "_".join(key)] = value
+        received = loss(**kwargs)
+        assert len(received) == len(loss.out_keys)
+        for key, value in zip(loss.out_keys, received, strict=True):
+            torch.testing.assert_close(value, expected[key])
+
+    def test_the_input_is_left_as_it_was(self):
+        loss, data = self.make_loss(), self.make_loss_data()
+        before = data.clone()
+        loss(data)
+        assert set(data.keys(True, True)) == set(before.keys(True, True))
+        for key in before.keys(True, True):
+            assert torch.equal(data[key], before[key]), key
+
+    def test_every_reduction_has_its_shape(self):
+        for reduction in self.reductions:
+            data = self.make_loss_data()
+            out = self.make_loss(reduction=reduction)(data)
+            for key, value in out.items():
+                if key.startswith("loss"):
+                    assert value.shape == (data.shape if reduction == "none" else ()), key
+
+    # --- parameters
+    def test_parameters_are_there_once_and_all_get_a_gradient(self):
+        loss = self.make_loss()
+        parameters = dict(loss.named_parameters())
+        assert bool(parameters) == self.has_networks
+        assert len({id(p) for p in parameters.values()}) == len(parameters)
+        if not self.has_networks:
+            return
+        self._total(loss(self.make_loss_data())).backward()
+        for name, parameter in parameters.items():
+            assert parameter.grad is not None, name
+            assert parameter.grad.isfinite().all(), name
+
+    def test_the_state_survives_a_file(self):
+        first, second, data = self.make_loss(), self.make_loss(), self.make_loss_data()
+        with torch.no_grad():
+            for parameter in first.parameters():
+                parameter += 0.05
+        second.load_state_dict(saved(first.state_dict()))
+        self._assert_equal(second(data), first(data))
+
+    def test_a_deepcopy_computes_the_same_and_shares_nothing(self):
+        first, data = self.make_loss(), self.make_loss_data()
+        expected = first(data)
+        second = copy.deepcopy(first)
+        theirs = {id(p) for p in first.parameters()}
+        assert not theirs & {id(p) for p in second.parameters()}
+        with torch.no_grad():
+            for parameter in first.parameters():
+                parameter.zero_()
+        self._assert_equal(second(data), expected)
+
+    def test_it_moves_to_float64(self):
+        loss = self.make_loss().to(torch.float64)
+        assert all(p.dtype == torch.float64 for p in loss.parameters())
+        out = loss(self.make_loss_data(torch.float64))
+        assert self._total(out).dtype == torch.float64
+
+    @pytest.mark.gpu
+    @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+    def test_it_moves_to_a_gpu(self):
+        loss, data = self.make_loss(), self.make_loss_data()
+        expected = self._total(loss(data)).item()
+        loss = loss.to("cuda")
+        total = self._total(loss(data.to("cuda")))
+        assert total.device.type == "cuda"
+        assert total.item() == pytest.approx(expected, rel=1e-3, abs=1e-4)
+
+    def test_parameters_can_be_reset(self):
+        loss = self.make_loss()
+        with torch.no_grad():
+            for parameter in loss.parameters():
+                parameter += 1000
+        before = {name: p.clone() for name, p in loss.named_parameters()}
+        loss.reset_parameters_recursive()
+        for name, parameter in loss.named_parameters():
+            assert (parameter != before[name]).any(), name
+
+    def test_the_global_generator_is_untouched(self):
+        loss, data = self.make_loss(), self.make_loss_data()
+        state = torch.get_rng_state()
+        loss(data)
+        assert torch.equal(torch.get_rng_state(), state)

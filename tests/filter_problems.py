@@ -1,0 +1,189 @@
+"""Problems for the sequence filter: one model, one set of sequences, the oracle beside them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import oracles
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional import (
+    StateSpace,
+    filter_sequence,
+)
+from torchrl_drbpn.functional.recurrence import MeanNetwork
+
+SIZES = [
+    pytest.param(3, 7, id="state<obs"),
+    pytest.param(4, 4, id="state=obs"),
+    pytest.param(6, 3, id="state>obs"),
+]
+FORMS = [
+    pytest.param("innovation", False, id="innovation, diagonal R"),
+    pytest.param("innovation", True, id="innovation, full R"),
+    pytest.param("information", False, id="information, diagonal R"),
+    pytest.param("loop", True, id="loop, full R"),
+]
+FAST = ["innovation", "information"]
+TOLERANCE = 1e-10
+
+
+def assert_equal(actual: Tensor, expected: Tensor, tolerance: float = TOLERANCE) -> None:
+    torch.testing.assert_close(actual, expected, atol=tolerance, rtol=tolerance)
+
+
+class Problem:
+    """A random model and data, as leaves to differentiate by, for the library and the oracle.
+
+    Covariances enter through a factor (or variances), so that no gradient depends on which
+    triangle of a symmetric matrix a formula happens to read.
+    """
+
+    def __init__(
+        self,
+        state: int,
+        obs: int,
+        *,
+        batch: int = 3,
+        time: int = 6,
+        seed: int = 0,
+        full_noise: bool = False,
+        resets: bool = True,
+        restarts: bool = False,
+        hidden: tuple[int, ...] = (5,),
+        residual: bool = True,
+        activation: str = "tanh",
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
+        data = oracles.simulate(system, batch, time, seed=seed, reset_rate=0.3 if resets else 0.0)
+        g = torch.Generator().manual_seed(seed + 9)
+        self.full_noise, self.residual, self.activation = full_noise, residual, activation
+        self.observed, self.reset = data.observed, data.reset.clone()
+        if resets and time > 2:
+            # An episode start on an empty frame, on a full one, and none in the last row.
+            self.reset[0, 0] = self.reset[0, 2] = True
+            self.reset[-1] = False
+        self.restart = None
+        leaves = {
+            "observation": data.observation,
+            "previous_action": data.previous_action,
+            "start_mean": data.start_mean,
+            "transition_root": torch.linalg.cholesky(system.transition_cov),
+            "noise": torch.linalg.cholesky(system.noise) if full_noise else system.noise.diagonal(),
+            "matrix": system.matrix,
+            "action_matrix": system.action_matrix,
+            "bias": system.bias,
+            "initial_mean": system.initial_mean,
+            "initial_root": torch.linalg.cholesky(system.initial_cov),
+        }
+        if restarts:
+            self.restart = torch.rand(batch, time, generator=g) < 0.4
+            self.restart[0, 2] = self.restart[-1, 1] = True  # with and without a reset beside it
+            leaves["restart_mean"] = torch.randn(batch, time, state, generator=g).double()
+        widths = [state + system.action_dim, *hidden, state]
+        for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
+            weight = torch.randn(fan_out, fan_in, generator=g).double()
+            leaves[f"weight{i}"] = (0.5 if residual else 1.0) * weight / math.sqrt(fan_in)
+            leaves[f"bias{i}"] = 0.1 * torch.randn(fan_out, generator=g).double()
+        self.layers = len(widths) - 1
+        self.leaves = {k: v.to(dtype).clone().requires_grad_() for k, v in leaves.items()}
+
+    def network(self) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        return (
+            tuple(self.leaves[f"weight{i}"] for i in range(self.layers)),
+            tuple(self.leaves[f"bias{i}"] for i in range(self.layers)),
+        )
+
+    def covs(self) -> tuple[Tensor, Tensor, Tensor]:
+        q, p = self.leaves["transition_root"], self.leaves["initial_root"]
+        r = self.leaves["noise"]
+        return q @ q.mT, p @ p.mT, r @ r.mT if self.full_noise else r
+
+    def model(self) -> StateSpace:
+        q, p, r = self.covs()
+        return StateSpace(
+            transition=MeanNetwork(*self.network(), self.residual, self.activation),
+            transition_cov=q,
+            emission_matrix=self.leaves["matrix"],
+            emission_cov=r,
+            action_matrix=self.leaves["action_matrix"],
+            emission_offset=self.leaves["bias"],
+            initial_mean=self.leaves["initial_mean"],
+            initial_cov=p,
+        )
+
+    def arguments(self) -> tuple[Tensor, ...]:
+        named = (self.leaves[k] for k in ("start_mean", "previous_action", "observation"))
+        return (*named, self.observed, self.reset)
+
+    def restarts(self) -> dict[str, Any]:
+        return {"restart": self.restart, "restart_mean": self.leaves.get("restart_mean")}
+
+    def fast(self, form: str) -> tuple[Tensor, Tensor, Tensor]:
+        out = filter_sequence(
+            self.model(), *self.arguments(), **self.restarts(), return_cov=True, form=form
+        )
+        assert out.cov is not None
+        return out.mean, out.cov, out.log_likelihood
+
+    def slow(self) -> tuple[Tensor, Tensor, Tensor]:
+        q, p, r = self.covs()
+        weights, biases = self.network()
+        out = oracles.filter_sequence(
+            observation=self.leaves["observation"],
+            observed=self.observed,
+            previous_action=self.leaves["previous_action"],
+            reset=self.reset,
+            start_mean=self.leaves["start_mean"],
+            initial_mean=self.leaves["initial_mean"],
+            initial_cov=p,
+            transition=oracles.mean_network(weights, biases, self.residual, self.activation),
+            transition_cov=q,
+            matrix=self.leaves["matrix"],
+            noise=r if self.full_noise else torch.diag(r),
+            action_matrix=self.leaves["action_matrix"],
+            bias=self.leaves["bias"],
+            **self.restarts(),
+        )
+        return out.mean, out.cov, out.log_likelihood
+
+    def gradients(self, outputs: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Differentiate one fixed random function of all the outputs by every leaf."""
+        g = torch.Generator().manual_seed(3)
+        loss = torch.zeros((), dtype=outputs[0].dtype)
+        for out in outputs:
+            weight = torch.randn(out.shape, generator=g, dtype=torch.float64).to(out.dtype)
+            loss = loss + (weight * out).sum() + 0.1 * (weight * out.square()).sum()
+        found = torch.autograd.grad(
+            loss, list(self.leaves.values()), allow_unused=True, retain_graph=True
+        )
+        return {
+            k: torch.zeros_like(v) if grad is None else grad
+            for (k, v), grad in zip(self.leaves.items(), found, strict=True)
+        }
+
+
+def assert_same(
+    problem: Problem,
+    actual: tuple[Tensor, ...],
+    expected: tuple[Tensor, ...],
+    tolerance: float = TOLERANCE,
+) -> None:
+    for name, a, e in zip(("mean", "cov", "log_likelihood"), actual, expected, strict=True):
+        torch.testing.assert_close(
+            a, e, atol=tolerance, rtol=tolerance, msg=lambda m, n=name: f"{n}: {m}"
+        )
+    found, truth = problem.gradients(actual), problem.gradients(expected)
+    for name in truth:
+        torch.testing.assert_close(
+            found[name],
+            truth[name],
+            atol=tolerance * max(1.0, float(truth[name].abs().max())),
+            rtol=tolerance,
+            msg=lambda m, n=name: f"gradient by {n}: {m}",
+        )
