@@ -46,7 +46,8 @@ def config(*overrides: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES, ids=lambda value: value)
 def test_every_choice_of_every_group_composes_into_settings(group: str, choice: str) -> None:
-    read_settings(config(f"{group}={choice}"))
+    settings = read_settings(config(f"{group}={choice}"))
+    assert settings.collector.frames % settings.optim.sequence_length == 0
 
 
 def test_overlays_can_be_combined() -> None:

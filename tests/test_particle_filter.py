@@ -679,3 +679,9 @@ def test_the_recipe_builds_it_with_the_settings_of_conf():
     assert (filter.num_particles, filter.hidden_dim, filter.latent_dim) == (10, 128, 256)
     assert belief.feature_dim == 128
     assert belief.model_loss is not None
+
+
+@pytest.mark.parametrize("given", [["a", "a", "b", "c"], ["a", "b", "c", "a"]])
+def test_two_entries_under_one_key_are_refused(given):
+    with pytest.raises(ValueError, match="a key of its own"):
+        ParticleFilterModule(ParticleFilter(OBS, ACTION), in_keys=given)

@@ -121,9 +121,12 @@ def test_an_environment_is_left_as_it_was_by_what_it_refuses():
 
 
 def test_the_order_of_the_recipe_is_accepted_and_other_keys_do_not_matter():
-    staircase(partial(NOISE, complete_key=COMPLETE)(), MISSING(), NORM())
-    staircase(ObservedFromNaN(), partial(NOISE, complete_key=COMPLETE)(), MISSING(), FILL(), NORM())
-    staircase(NORM(in_keys=["other"]), MISSING())
+    noise = partial(NOISE, complete_key=COMPLETE)
+    recipe = staircase(noise(), MISSING(), NORM())
+    filled = staircase(ObservedFromNaN(), noise(), MISSING(), FILL(), NORM())
+    for env in (recipe, filled):
+        assert {"observation", "observed", COMPLETE} <= set(env.rollout(2).keys())
+    assert len(staircase(NORM(in_keys=["other"]), MISSING()).transform) == 2
 
 
 def test_a_writer_inside_the_workers_is_found_through_the_specs():

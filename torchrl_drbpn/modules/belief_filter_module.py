@@ -16,6 +16,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torchrl_drbpn.functional import tril_to_vector
+from torchrl_drbpn.modules._keys import read_entry, read_in_keys, read_out_keys
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 
 __all__ = ["BeliefFilterModule"]
@@ -110,17 +111,25 @@ class BeliefFilterModule(TensorDictModuleBase):
         self.policy_input = policy_input
         self._default_recurrent_mode = default_recurrent_mode
         self._warned = False
-        self.in_keys = _read_in_keys(in_keys)
+        self.in_keys = read_in_keys(in_keys, IN_KEYS, "the filter")
         self._next_mean = unravel_key(("next", self.in_keys[4]))
         self._next_age = unravel_key(("next", self.in_keys[5]))
-        self._out = _read_out_keys(out_keys, [self._next_mean, self._next_age])
+        self._out = read_out_keys(
+            out_keys,
+            DEFAULT_OUT_KEYS,
+            OPTIONAL_OUT_KEYS,
+            [self._next_mean, self._next_age],
+            "the filter",
+        )
         self.out_keys = [*self._out.values(), self._next_mean, self._next_age]
 
     # ------------------------------------------------------------------ forward
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the belief; see the class for keys and modes."""
-        observation, observed, action, is_init = (self._get(tensordict, i) for i in range(4))
+        observation, observed, action, is_init = (
+            read_entry(tensordict, self.in_keys, i) for i in range(4)
+        )
         # Simulators take float32 actions beside float64 observations; a cast loses nothing there.
         action = action.to(self.filter.initial_mean.dtype)
         mean = tensordict.get(self.in_keys[4], None)
@@ -172,18 +181,6 @@ class BeliefFilterModule(TensorDictModuleBase):
         for name, key in self._out.items():
             tensordict.set(key, results[name])
         return tensordict
-
-    def _get(self, tensordict: TensorDictBase, index: int) -> Tensor:
-        value = tensordict.get(self.in_keys[index], None)
-        if value is not None:
-            return value
-        sources = {
-            1: "ObservationMissingness or ObservedFromNaN writes it (all True: nothing missing)",
-            2: "the PreviousAction transform writes it",
-            3: "TorchRL's InitTracker transform writes it",
-        }
-        hint = sources.get(index, "does the environment use another name? Pass in_keys")
-        raise KeyError(f"`{self.in_keys[index]}` is not in the tensordict: {hint}.")
 
     def _fresh_state(
         self, observation: Tensor, first: Tensor, sequence: bool
@@ -262,66 +259,3 @@ def _steps_since(reset: Tensor) -> Tensor:
     index = torch.arange(reset.shape[-1], device=reset.device).expand(reset.shape)
     last = torch.where(reset, index, 0).cummax(-1).values
     return (index - last).unsqueeze(-1)
-
-
-def _as_keys(given: Sequence[NestedKey], name: str) -> list[NestedKey]:
-    """Return a list of keys; a key may be any sequence of strings, as configurations give them."""
-    if isinstance(given, str) or not isinstance(given, Sequence):
-        raise TypeError(
-            f"`{name}` must be a list of keys or a dict, got {given!r} of type "
-            f"{type(given).__name__}."
-        )
-    return [unravel_key(key if isinstance(key, str) else tuple(key)) for key in given]
-
-
-def _check_distinct(keys: Sequence[NestedKey], name: str) -> None:
-    twice = sorted({str(key) for key in keys if list(keys).count(key) > 1})
-    if twice:
-        raise ValueError(
-            f"`{name}` must give every entry a key of its own, got {', '.join(twice)} twice."
-        )
-
-
-def _read_in_keys(
-    given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
-) -> list[NestedKey]:
-    if given is None:
-        return list(IN_KEYS)
-    if isinstance(given, Mapping):
-        unknown = [key for key in given if key not in IN_KEYS]
-        if unknown:
-            raise ValueError(f"`in_keys` names {unknown}; the filter reads {list(IN_KEYS)}.")
-        keys = [unravel_key(given.get(key, key)) for key in IN_KEYS]
-    else:
-        keys = _as_keys(given, "in_keys")
-        if len(keys) not in (4, 6):
-            raise ValueError(
-                f"`in_keys` must have 4 or 6 entries, in the order {list(IN_KEYS)}, got {keys}. "
-                "To rename one of them pass a dict such as {'observation': 'pixels_encoded'}."
-            )
-        keys = keys if len(keys) == 6 else [*keys, *IN_KEYS[4:]]
-    _check_distinct(keys, "in_keys")
-    return keys
-
-
-def _read_out_keys(
-    given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
-    recurrent: Sequence[NestedKey],
-) -> dict[NestedKey, NestedKey]:
-    """Map the canonical names to the user's keys; recurrent entries in a list are implied."""
-    names = (*DEFAULT_OUT_KEYS, *OPTIONAL_OUT_KEYS)
-    if given is None:
-        return {name: name for name in DEFAULT_OUT_KEYS}
-    if isinstance(given, Mapping):
-        pairs = {unravel_key(name): unravel_key(key) for name, key in given.items()}
-    else:
-        pairs = {key: key for key in _as_keys(given, "out_keys") if key not in recurrent}
-    unknown = [name for name in pairs if name not in names]
-    if unknown:
-        raise ValueError(
-            f"`out_keys` names {unknown}; the filter can write {list(names)}, and writes "
-            f"{list(recurrent)} in any case. To write one under another key pass a dict such as "
-            "{'features': 'embed'}; to rename the recurrent state pass in_keys."
-        )
-    _check_distinct([*pairs.values(), *recurrent], "out_keys")
-    return pairs

@@ -15,6 +15,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torchrl_drbpn.functional import effective_sample_size
+from torchrl_drbpn.modules._keys import read_entry, read_in_keys, read_out_keys
 from torchrl_drbpn.modules.belief_filter_module import _steps_since
 from torchrl_drbpn.modules.particle_model import ParticleFilter
 
@@ -107,16 +108,20 @@ class ParticleFilterModule(TensorDictModuleBase):
         self.filter = filter
         self._default_recurrent_mode = default_recurrent_mode
         self._warned = False
-        self.in_keys = _read_in_keys(in_keys)
-        self._out = _read_out_keys(out_keys)
+        self.in_keys = read_in_keys(in_keys, IN_KEYS, "the particle filter")
         self._next = [unravel_key(("next", key)) for key in self.in_keys[4:]]
+        self._out = read_out_keys(
+            out_keys, DEFAULT_OUT_KEYS, OPTIONAL_OUT_KEYS, self._next, "the particle filter"
+        )
         self.out_keys = [*self._out.values(), *self._next]
 
     # ------------------------------------------------------------------ forward
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write features and likelihood; see the class for keys and modes."""
-        observation, observed, action, is_init = (self._get(tensordict, i) for i in range(4))
+        observation, observed, action, is_init = (
+            read_entry(tensordict, self.in_keys, i) for i in range(4)
+        )
         # Simulators take float32 actions beside float64 observations; a cast loses nothing there.
         action = action.to(self.filter.proposal.weight.dtype)
         first = is_init.squeeze(-1)
@@ -156,18 +161,6 @@ class ParticleFilterModule(TensorDictModuleBase):
                 value = effective_sample_size(out.log_weight)
             tensordict.set(key, value)
         return tensordict
-
-    def _get(self, tensordict: TensorDictBase, index: int) -> Tensor:
-        value = tensordict.get(self.in_keys[index], None)
-        if value is not None:
-            return value
-        sources = {
-            1: "ObservationMissingness or ObservedFromNaN writes it (all True: nothing missing)",
-            2: "the PreviousAction transform writes it",
-            3: "TorchRL's InitTracker transform writes it",
-        }
-        hint = sources.get(index, "does the environment use another name? Pass in_keys")
-        raise KeyError(f"`{self.in_keys[index]}` is not in the tensordict: {hint}.")
 
     def _fresh_state(
         self, observation: Tensor, first: Tensor, sequence: bool
@@ -226,46 +219,3 @@ class ParticleFilterModule(TensorDictModuleBase):
             },
             expand_specs=True,
         )
-
-
-def _read_in_keys(
-    given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
-) -> list[NestedKey]:
-    if given is None:
-        return list(IN_KEYS)
-    if isinstance(given, Mapping):
-        pairs = {unravel_key(name): unravel_key(key) for name, key in given.items()}
-        unknown = [name for name in pairs if name not in IN_KEYS]
-        if unknown:
-            raise ValueError(
-                f"`in_keys` names {unknown}; the particle filter reads {list(IN_KEYS)}."
-            )
-        return [pairs.get(key, key) for key in IN_KEYS]
-    keys = [unravel_key(key) for key in given]
-    if len(keys) not in (4, len(IN_KEYS)):
-        raise ValueError(
-            f"`in_keys` must have 4 or {len(IN_KEYS)} entries, in the order {list(IN_KEYS)}, got "
-            f"{keys}. To rename one of them pass a dict such as {{'observation': 'encoded'}}."
-        )
-    return [*keys, *IN_KEYS[len(keys) :]]
-
-
-def _read_out_keys(
-    given: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None,
-) -> dict[NestedKey, NestedKey]:
-    """Map the canonical names to the user's keys; recurrent entries in a list are implied."""
-    names = (*DEFAULT_OUT_KEYS, *OPTIONAL_OUT_KEYS)
-    if given is None:
-        return {name: name for name in DEFAULT_OUT_KEYS}
-    if isinstance(given, Mapping):
-        pairs = {unravel_key(name): unravel_key(key) for name, key in given.items()}
-    else:
-        keys = [unravel_key(key) for key in given]
-        pairs = {key: key for key in keys if not (isinstance(key, tuple) and key[0] == "next")}
-    unknown = [name for name in pairs if name not in names]
-    if unknown:
-        raise ValueError(
-            f"`out_keys` names {unknown}; the particle filter can write {list(names)}. To write "
-            "one under another key pass a dict such as {'features': 'embed'}."
-        )
-    return pairs
