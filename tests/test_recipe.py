@@ -27,6 +27,7 @@ import torch
 pytest.importorskip("hydra")
 from recipe_tools import ROOT, differences, make_config, read_table  # isort: skip
 
+from assembly import run_folder
 from assembly.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from assembly.errors import UserError
 from assembly.evaluation import evaluate, make_evaluation_environment
@@ -371,3 +372,14 @@ def test_a_bad_value_on_the_command_line_prints_one_line_and_leaves_no_folder(
     assert done.returncode == 2
     assert done.stderr == "error: `missingness.eta` must lie in [0, 1], got 1.5.\n"
     assert not list(tmp_path.rglob("*seed*"))
+
+
+def test_a_run_folder_from_before_a_setting_was_added_stays_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_folder, "_LATER_SETTINGS", {"heads.width": 3, "heads.hidden": [1]})
+    (tmp_path / "config.yaml").write_text("heads:\n  hidden: [64, 64]\n")
+
+    config = read_config(tmp_path)
+
+    assert config["heads"] == {"hidden": [64, 64], "width": 3}  # what was written is kept

@@ -30,6 +30,10 @@ _PACKAGES = (
     "hydra-core",
 )
 
+# Settings that came after the first run folders, with the value that says what a run without them
+# did: a folder stays readable when a setting is added. "group.key": value
+_LATER_SETTINGS: dict[str, Any] = {}
+
 
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:
     """Write the resolved configuration of a run.
@@ -48,7 +52,8 @@ def read_config(folder: Path) -> dict[str, Any]:
         folder: the run folder.
 
     Returns:
-        The configuration as plain containers.
+        The configuration as plain containers; settings that came after it was written are added
+        with the value that describes it.
 
     Raises:
         UserError: if there is none, or it can't be read.
@@ -62,7 +67,19 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise UserError(f"`{path}` can't be read as a configuration: is it damaged?") from error
     if not isinstance(config, dict):
         raise UserError(f"`{path}` must hold the settings of a run, got {type(config).__name__}.")
-    return {str(key): value for key, value in config.items()}
+    return _with_later_settings({str(key): value for key, value in config.items()})
+
+
+def _with_later_settings(config: dict[str, Any]) -> dict[str, Any]:
+    """Give an older configuration the settings that came later, at the value it had acted on."""
+    for name, value in _LATER_SETTINGS.items():
+        *path, last = name.split(".")
+        group: Any = config
+        for part in path:
+            group = group.setdefault(part, {}) if isinstance(group, dict) else None
+        if isinstance(group, dict):
+            group.setdefault(last, value)
+    return config
 
 
 def write_versions(folder: Path) -> None:
