@@ -12,6 +12,7 @@ from timing import ROOT
 if str(ROOT / "recipes") not in sys.path:
     sys.path.insert(0, str(ROOT / "recipes"))
 
+from assembly.algorithms.ppo import PPO
 from assembly.rollout import add_advantages, minibatches, to_sequences
 from assembly.settings import read_settings
 from assembly.training import Training, assemble, train_rollout
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from assembly.settings import Settings
 
 __all__ = [
+    "PPO",
     "Training",
     "add_advantages",
     "assemble",

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from recipe import (
+    PPO,
     Training,
     add_advantages,
     assemble,
@@ -37,9 +38,14 @@ class Update:
     """One gradient step, with a clock at the borders of its parts."""
 
     def __init__(
-        self, training: Training, batch: TensorDictBase, max_norm: float, clock: Callable[[], float]
+        self,
+        training: Training,
+        ppo: PPO,
+        batch: TensorDictBase,
+        max_norm: float,
+        clock: Callable[[], float],
     ) -> None:
-        self.training, self.batch, self.max_norm, self.clock = training, batch, max_norm, clock
+        self.ppo, self.batch, self.max_norm, self.clock = ppo, batch, max_norm, clock
         self.parameters = list(training.agent.parameters())
         self.rows: list[dict[str, float]] = []
         self._in_filter = 0.0
@@ -62,7 +68,7 @@ class Update:
 
     def __call__(self) -> None:
         """Take the step and note its times."""
-        loss, optimizer = self.training.loss, self.training.optimizer
+        loss, optimizer = self.ppo.loss, self.ppo.optimizer
         self._in_filter, self._features_done = 0.0, None
         begin = self.clock()
         out = loss(self.batch)
@@ -112,9 +118,13 @@ def main() -> None:
         training = assemble(settings)
         data = training.collector.rollout()
         add_advantages(data, training.agent, training.gae)
-        sequences = to_sequences(data, training.loss, settings.optim.sequence_length)
-        batch = next(minibatches(sequences, settings.optim.minibatches, training.generator))
-        updates[name] = Update(training, batch, settings.optim.max_grad_norm, CLOCKS[args.clock])
+        ppo = training.algorithm
+        assert isinstance(ppo, PPO)
+        sequences = to_sequences(data, ppo.loss, settings.optim.sequence_length)
+        batch = next(minibatches(sequences, settings.optim.minibatches, ppo.generator))
+        updates[name] = Update(
+            training, ppo, batch, settings.optim.max_grad_norm, CLOCKS[args.clock]
+        )
         titles[name] = (
             f"{name} ({batch.shape[0]} x {batch.shape[1]} = {batch.numel()} frames a minibatch)"
         )

@@ -126,7 +126,8 @@ def test_fresh_data_give_a_ratio_of_one(name):
     for _ in range(2):
         data = training.collector.rollout()
     add_advantages(data, training.agent, training.gae)
-    out = training.loss(to_sequences(data, training.loss, settings.optim.sequence_length))
+    loss = training.algorithm.loss
+    out = loss(to_sequences(data, loss, settings.optim.sequence_length))
     assert torch.allclose(out["max_ratio"], torch.ones(()), atol=1e-4)
     assert torch.allclose(out["ESS"].mean(), torch.ones(()), atol=1e-4)
     if name.startswith("fill"):

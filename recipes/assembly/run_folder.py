@@ -32,7 +32,9 @@ _PACKAGES = (
 
 # Settings that came after the first run folders, with the value that says what a run without them
 # did: a folder stays readable when a setting is added. "group.key": value
-_LATER_SETTINGS: dict[str, Any] = {}
+_LATER_SETTINGS: dict[str, Any] = {
+    "algo": {"_target_": "assembly.algorithms.ppo.build", "name": "ppo"},
+}
 
 
 def write_config(folder: Path, config: Mapping[str, Any]) -> None:

@@ -147,6 +147,7 @@ class Settings:
     normalisation: NormalisationSettings
     heads: HeadSettings
     collector: CollectorSettings
+    algo: dict[str, Any]
     loss: LossSettings
     optim: OptimSettings
     evaluation: EvaluationSettings

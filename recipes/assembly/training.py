@@ -1,4 +1,4 @@
-"""Training: collect, value, update; one path for every belief module."""
+"""Training: collect, value, update; one path for every belief module and algorithm."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
-from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
 from assembly.agent import Agent, add_primers
+from assembly.algorithms import Algorithm, build_algorithm
 from assembly.beliefs import Belief, build_belief
 from assembly.environment import make_environment, task_dims
 from assembly.errors import UserError
@@ -21,11 +21,9 @@ from assembly.rollout import (
     add_advantages,
     explained_variance,
     log_likelihood_per_entry,
-    minibatches,
     realised_missing_ratio,
-    to_sequences,
 )
-from assembly.settings import OptimSettings, Settings
+from assembly.settings import Settings
 
 _RECENT_EPISODES = 100
 
@@ -57,10 +55,8 @@ class Training:
     agent: Agent
     env: TransformedEnv
     collector: Collector
-    loss: LossModule
     gae: GAE
-    optimizer: torch.optim.Optimizer
-    generator: torch.Generator
+    algorithm: Algorithm
     progress: Progress
 
 
@@ -103,18 +99,13 @@ def assemble(settings: Settings) -> Training:
     )
     gae = GAE(gamma=settings.loss.gamma, lmbda=settings.loss.lmbda, value_network=None)
     gae.set_keys(reward="scaled_reward")
-    optimizer = torch.optim.Adam(
-        agent.parameters(), lr=settings.optim.lr, eps=settings.optim.eps, fused=True
-    )
     return Training(
         belief=belief,
         agent=agent,
         env=env,
         collector=collector,
-        loss=agent.make_loss(settings.loss),
         gae=gae,
-        optimizer=optimizer,
-        generator=torch.Generator().manual_seed(settings.seed),
+        algorithm=build_algorithm(settings, agent),
         progress=Progress(),
     )
 
@@ -152,10 +143,9 @@ def train_rollout(
         and ``frames``, ``return`` (raw) and ``length`` of each episode that finished.
     """
     progress = training.progress
-    lr = settings.optim.lr * max(0.0, 1 - progress.frames / settings.total_frames)
+    remaining = max(0.0, 1 - progress.frames / settings.total_frames)
     data = training.collector.rollout()
     add_advantages(data, training.agent, training.gae)
-    sequences = to_sequences(data, training.loss, settings.optim.sequence_length)
     progress.frames += data.numel()
     finished = _finished_episodes(data, progress.frames)
     progress.episodes += len(finished)
@@ -168,11 +158,10 @@ def train_rollout(
         "log_likelihood": log_likelihood_per_entry(data),
         "explained_variance": explained_variance(data),
         "action_std": data.get("scale").mean().item(),
-        "lr": lr,
         **training.belief.summary(),
     }
     # The rollout's own log-likelihood, of data not yet learned from, goes before the update's.
-    return _update(training, sequences, settings.optim, lr) | row, finished
+    return training.algorithm.update(data, remaining) | row, finished
 
 
 def _finished_episodes(data: TensorDictBase, frames: int) -> list[dict[str, Any]]:
@@ -185,33 +174,6 @@ def _finished_episodes(data: TensorDictBase, frames: int) -> list[dict[str, Any]
     pairs = zip(returns[done].tolist(), lengths[done].tolist(), strict=True)
     return [{"frames": frames, "return": value, "length": length} for value, length in pairs]
 
-
-def _update(
-    training: Training, sequences: TensorDict, optim: OptimSettings, lr: float
-) -> dict[str, float]:
-    """Take the gradient steps of one rollout; return the means of what the loss reports."""
-    optimizer, loss = training.optimizer, training.loss
-    parameters = list(training.agent.parameters())
-    for group in optimizer.param_groups:
-        group["lr"] = lr
-    seen: dict[str, list[torch.Tensor]] = {}
-    for _ in range(optim.epochs):
-        for minibatch in minibatches(sequences, optim.minibatches, training.generator):
-            out = loss(minibatch)
-            terms = {key: value for key, value in out.items() if isinstance(value, torch.Tensor)}
-            total = sum(value for key, value in terms.items() if key.startswith("loss"))
-            assert isinstance(total, torch.Tensor)
-            optimizer.zero_grad(set_to_none=True)
-            torch.autograd.backward(total)
-            terms["grad_norm"] = torch.nn.utils.clip_grad_norm_(parameters, optim.max_grad_norm)
-            optimizer.step()
-            for key, value in terms.items():
-                seen.setdefault(key, []).append(value.detach())
-    means = {key: torch.stack([v.mean() for v in values]).mean() for key, values in seen.items()}
-    return {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
-
-
-_NAMES = {"kl_approx": "kl", "ESS": "ess"}
 
 _COLUMNS = (
     "frames",
@@ -261,7 +223,7 @@ def training_state(training: Training) -> dict[str, Any]:
     progress, keeps = training.progress, training.env.base_env.supports_state
     return {
         "agent": training.agent.state_dict(),
-        "optimizer": training.optimizer.state_dict(),
+        **training.algorithm.state_dict(),
         "transforms": training.env.state_dict(),
         # None where the simulators keep their state to themselves: new episodes start then.
         "simulators": training.env.base_env.state_dict() if keeps else None,
@@ -269,7 +231,6 @@ def training_state(training: Training) -> dict[str, Any]:
         # goes on): its own state_dict leaves it out and starts new episodes.
         "carrier": training.collector._carrier.to_dict() if keeps else None,
         "torch_generator": torch.get_rng_state(),
-        "minibatch_generator": training.generator.get_state(),
         "progress": {
             "frames": progress.frames,
             "episodes": progress.episodes,
@@ -293,13 +254,12 @@ def restore(training: Training, state: dict[str, Any], source: str) -> None:
     """
     try:
         training.agent.load_state_dict(state["agent"])
-        training.optimizer.load_state_dict(state["optimizer"])
+        training.algorithm.load_state_dict(state)
         training.env.load_state_dict(state["transforms"])
         if state["simulators"] is not None:
             training.env.base_env.load_state_dict(state["simulators"])
             carrier = TensorDict.from_dict(state["carrier"], batch_size=training.env.batch_size)
             training.collector._carrier = carrier
-        training.generator.set_state(state["minibatch_generator"])
         kept = dict(state["progress"])
         kept["returns"] = deque(kept["returns"], maxlen=_RECENT_EPISODES)
         training.progress = Progress(**kept)

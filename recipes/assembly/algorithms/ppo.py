@@ -1,0 +1,108 @@
+"""Clipped PPO, and the likelihood of the belief's own model, by Adam over minibatches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from assembly.agent import Agent
+from assembly.rollout import minibatches, to_sequences
+from assembly.settings import OptimSettings, Settings
+
+_NAMES = {"kl_approx": "kl", "ESS": "ess"}
+
+
+class PPO:
+    """Take epochs of minibatch steps on one loss over belief, policy and value.
+
+    Args:
+        agent: whose parameters are changed.
+        settings: of the run; ``loss`` and ``optim`` are this algorithm's, ``seed`` orders the
+            minibatches.
+
+    Attributes:
+        loss: its outputs named ``loss*`` are summed.
+        optimizer: Adam over all parameters of the agent.
+        generator: of the order of minibatches.
+    """
+
+    def __init__(self, agent: Agent, settings: Settings) -> None:
+        self.agent, self.optim = agent, settings.optim
+        self.loss = agent.make_loss(settings.loss)
+        self.optimizer = torch.optim.Adam(
+            agent.parameters(), lr=settings.optim.lr, eps=settings.optim.eps, fused=True
+        )
+        self.generator = torch.Generator().manual_seed(settings.seed)
+
+    def update(self, data: TensorDictBase, remaining: float) -> dict[str, float]:
+        """Take the gradient steps of one rollout.
+
+        Args:
+            data: rollout of batch size ``(environments, time)`` with advantages.
+            remaining: share of the run still to come; the learning rate falls with it.
+
+        Returns:
+            The means of what the loss reports, and the learning rate.
+        """
+        lr = self.optim.lr * remaining
+        sequences = to_sequences(data, self.loss, self.optim.sequence_length)
+        return {**_update(self, sequences, self.optim, lr), "lr": lr}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the optimiser's state and the generator's.
+
+        Returns:
+            Entries of the checkpoint, by name.
+        """
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "minibatch_generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take up a saved state.
+
+        Args:
+            state: a checkpoint.
+        """
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["minibatch_generator"])
+
+
+def _update(ppo: PPO, sequences: TensorDict, optim: OptimSettings, lr: float) -> dict[str, float]:
+    """Take the gradient steps of one rollout; return the means of what the loss reports."""
+    optimizer, loss = ppo.optimizer, ppo.loss
+    parameters = list(ppo.agent.parameters())
+    for group in optimizer.param_groups:
+        group["lr"] = lr
+    seen: dict[str, list[torch.Tensor]] = {}
+    for _ in range(optim.epochs):
+        for minibatch in minibatches(sequences, optim.minibatches, ppo.generator):
+            out = loss(minibatch)
+            terms = {key: value for key, value in out.items() if isinstance(value, torch.Tensor)}
+            total = sum(value for key, value in terms.items() if key.startswith("loss"))
+            assert isinstance(total, torch.Tensor)
+            optimizer.zero_grad(set_to_none=True)
+            torch.autograd.backward(total)
+            terms["grad_norm"] = torch.nn.utils.clip_grad_norm_(parameters, optim.max_grad_norm)
+            optimizer.step()
+            for key, value in terms.items():
+                seen.setdefault(key, []).append(value.detach())
+    means = {key: torch.stack([v.mean() for v in values]).mean() for key, values in seen.items()}
+    return {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
+
+
+def build(settings: Settings, agent: Agent) -> PPO:
+    """Build PPO.
+
+    Args:
+        settings: of the run.
+        agent: whose parameters it changes.
+
+    Returns:
+        The algorithm.
+    """
+    return PPO(agent, settings)
