@@ -18,11 +18,11 @@ import hydra
 from assembly.belief_figure import save_figure
 from assembly.console import run_or_explain, say
 from assembly.errors import UserError
+from assembly.report_figures import learning_curves, robustness
+from assembly.report_page import csv_cells, study_page
+from assembly.report_runs import find_folders, read_study
+from assembly.report_tables import evaluation_rows, summary_rows, training_rows
 from assembly.run_folder import write_table, write_whole
-from assembly.study import find_folders, read_study
-from assembly.study_figures import learning_curves, robustness
-from assembly.study_page import csv_cells, study_page
-from assembly.study_tables import evaluation_rows, summary_rows, training_rows
 from omegaconf import DictConfig, OmegaConf
 
 # In this order: the page, which names the others, comes last.

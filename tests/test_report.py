@@ -22,11 +22,11 @@ pytest.importorskip("matplotlib")
 from recipe_tools import make_config  # isort: skip
 
 from assembly.errors import UserError
+from assembly.report_commands import training_command
+from assembly.report_runs import find_folders, flat, read_study
+from assembly.report_tables import format_number
 from assembly.run import EVALUATION_COLUMNS
 from assembly.run_folder import Table, write_config
-from assembly.study import find_folders, flat, read_study
-from assembly.study_commands import training_command
-from assembly.study_tables import format_number
 from report import run
 
 FRAMES = [100, 200, 300, 400]

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from assembly.errors import UserError
-from assembly.study import StudyRun, flat, point_order
+from assembly.report_runs import StudyRun, flat, point_order
 
 _CONF = Path(__file__).parents[2] / "conf"
 # Always written out: a reader looks for them.

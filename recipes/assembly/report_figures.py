@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from assembly.belief_figure import STYLE
-from assembly.study import StudyRun, grouped, point_order
-from assembly.study_tables import final_evaluation, training_rows
+from assembly.report_runs import StudyRun, grouped, point_order
+from assembly.report_tables import final_evaluation, training_rows
 
 _COLOURS = ("#1f6fb4", "#d1622b", "#3a923a", "#8d5aa8", "#7f6a4f", "#c44e7f", "#5f6b73")
 _PANEL = (4.3, 3.3)  # inches

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from assembly.study import StudyRun, grouped
-from assembly.study_commands import evaluation_command, report_command, training_command
-from assembly.study_tables import KEPT, format_number
+from assembly.report_commands import evaluation_command, report_command, training_command
+from assembly.report_runs import StudyRun, grouped
+from assembly.report_tables import KEPT, format_number
 
 _TRAINING_COLUMNS = (
     ("return", "training return"),
@@ -26,7 +26,7 @@ def study_page(
 
     Args:
         runs: of the study.
-        summary: rows of :func:`assembly.study_tables.summary_rows`.
+        summary: rows of :func:`assembly.report_tables.summary_rows`.
         figures: names of the PNG files beside the page.
         title: its heading.
         out: folder of the study.

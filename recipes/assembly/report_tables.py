@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from assembly.study import Row, StudyRun, grouped, mean_of_known, point_order
+from assembly.report_runs import Row, StudyRun, grouped, mean_of_known, point_order
 
 
 def training_rows(run: StudyRun, count: int) -> list[Row]:
