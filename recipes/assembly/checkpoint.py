@@ -63,6 +63,19 @@ def last_checkpoint(folder: Path) -> Path:
     return found[-1]
 
 
+def checkpoint_frames(folder: Path) -> int | None:
+    """Return the environment steps of the latest checkpoint of a run.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        Steps, or None where there is no checkpoint.
+    """
+    found = sorted((folder / "checkpoints").glob(_PATTERN))
+    return int(found[-1].stem.removeprefix("frames_")) if found else None
+
+
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint.
 

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from assembly.composition import composed_config
 from assembly.errors import UserError
 from assembly.report_runs import StudyRun, flat, point_order
 
-_CONF = Path(__file__).parents[2] / "conf"
 # Always written out: a reader looks for them.
 _SHOWN = ("env.version", "seed", "total_frames")
 # Where a run was made and what it printed does not belong to what it computed.
@@ -44,14 +41,14 @@ def training_command(run: StudyRun) -> str:
         "noise": "gaussian" if s.noise.sigma > 0 else "none",
     }
     try:
-        defaults = _composed([])
+        defaults = composed_config([])
         chosen = {
             "belief": defaults["belief"].get("name"),
             "missingness": defaults["missingness"]["mechanism"],
             "noise": "gaussian" if defaults["noise"]["sigma"] > 0 else "none",
         }
         groups += [f"{group}={name}" for group, name in choices.items() if name != chosen[group]]
-        base = flat(_composed(groups))
+        base = flat(composed_config(groups))
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(
             f"`{run.name}` can't be put into a command, conf/ lacks a group of "
@@ -106,20 +103,6 @@ def report_command(runs: Sequence[StudyRun], out: Path, options: Sequence[str] =
     listed = ",".join(f"runs/{name}" for name in names)
     words = [f"run=[{listed}]", f"out=results/{out.name}", *options]
     return " ".join(["python recipes/report.py", *(shlex.quote(word) for word in words)])
-
-
-def _composed(overrides: Sequence[str]) -> dict[str, Any]:
-    """Compose the training configuration, inside a Hydra job or outside one."""
-    OmegaConf.register_new_resolver("run_folder", lambda resume, new: resume or new, replace=True)
-    if GlobalHydra.instance().is_initialized():
-        composed = compose("config", list(overrides))
-    else:
-        with initialize_config_dir(str(_CONF), version_base="1.3"):
-            composed = compose("config", list(overrides))
-    plain = OmegaConf.to_container(composed, resolve=True)
-    if not isinstance(plain, Mapping):
-        raise TypeError(f"conf/config.yaml must be a mapping, got {type(plain).__name__}")
-    return {str(key): value for key, value in plain.items()}
 
 
 def _value(value: Any) -> str:

@@ -1,0 +1,75 @@
+"""Run a grid of runs as one job: ``python recipes/study.py study=robust``.
+
+A study is a file of conf/study: axes (tasks, methods, seeds, ...), each with choices, each choice
+a list of overrides of recipes/ppo_drbpn.py. Every combination is a cell, with a run folder
+``runs/<study>/<cell>`` and its printed lines in ``runs/<study>/logs``. Call it again after anything
+at all, and it goes on: what is done is skipped, what was cut off is resumed from its last
+checkpoint, and a run that an earlier call has left running is waited for. Ctrl-C and SIGTERM let
+the runs save before they leave. A cell that failed is started again by ``retry_failed=true`` only.
+
+``dry_run=true`` prints how far the study is, also while it runs; ``at_once=4`` runs four cells at
+a time; ``'only=hopper-*'`` takes a part. ``python recipes/report.py 'run=runs/robust/*'
+out=results/robust`` then makes the tables.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+from assembly.console import run_or_explain
+from assembly.errors import UserError
+from assembly.study_cells import StudyFolder
+from assembly.study_grid import read_grid
+from assembly.study_job import StudyJob
+from omegaconf import DictConfig, OmegaConf
+
+
+def run(config: dict[str, Any]) -> int:
+    """Run a study, or show how far it is.
+
+    Args:
+        config: see conf/study.yaml.
+
+    Returns:
+        The exit status: 0 where every cell is done.
+    """
+    for name, least in (("at_once", 1), ("status_seconds", 0)):
+        value = config[name]
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or value < least:
+            raise UserError(f"`{name}` must be a number of {least} or more, got {value!r}.")
+    grid = read_grid(config["study"])
+    folder = StudyFolder(Path(config["folder"]) / grid.name)
+    job = StudyJob(
+        folder,
+        grid.chosen(config["only"]),
+        at_once=int(config["at_once"]),
+        retry_failed=config["retry_failed"],
+        status_seconds=config["status_seconds"],
+    )
+    if config["dry_run"]:
+        job.look()
+        job.show()
+        return 0
+    lock = folder.lock()
+    try:
+        job.look()
+        return job.run()
+    finally:
+        os.close(lock)
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="study")
+def main(config: DictConfig) -> None:
+    """Start from the command line."""
+    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    status = run_or_explain(lambda: run(plain))
+    if status:
+        sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()
