@@ -17,6 +17,9 @@ CONF = ROOT / "conf"
 if str(ROOT / "recipes") not in sys.path:
     sys.path.insert(0, str(ROOT / "recipes"))
 
+# Every belief module of the recipe, found on disk: a new one is tested without an edit here.
+BELIEFS = sorted(path.stem for path in (CONF / "belief").glob("*.yaml"))
+
 TIMES = ("steps_per_second", "wall_time")
 
 

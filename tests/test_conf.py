@@ -22,7 +22,7 @@ from assembly.beliefs import build_belief  # noqa: E402
 from assembly.environment import task_dims  # noqa: E402
 from assembly.errors import UserError  # noqa: E402
 from assembly.resume import resumed_config  # noqa: E402
-from assembly.run_folder import write_config  # noqa: E402
+from assembly.run_folder import read_config, write_config  # noqa: E402
 from assembly.settings import EnvSettings, read_settings  # noqa: E402
 from hydra import compose, initialize_config_dir  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
@@ -73,6 +73,14 @@ def test_every_default_is_explained_on_its_line_or_above(path: Path) -> None:
             assert "#" in text or text.endswith(":"), f"{path.name}: {text}"
 
 
+RUNS = sorted(ROOT.glob("results/*/runs/*"))
+
+
+@pytest.mark.parametrize("folder", RUNS, ids=lambda folder: folder.name)
+def test_every_run_of_our_results_is_still_readable(folder: Path) -> None:
+    assert read_settings(read_config(folder)).resume is None
+
+
 def test_a_missing_and_an_unknown_key_are_named() -> None:
     wrong = config()
     del wrong["optim"]["lr"]
@@ -102,6 +110,7 @@ def test_a_missing_and_an_unknown_key_are_named() -> None:
         ("optim.sequence_length=48", "`optim.sequence_length` must divide"),
         ("optim.minibatches=7", "`optim.minibatches` must divide the 128 sequences"),
         ("evaluation.modes=[best]", "`modes` must hold sampled and mean, got 'best'"),
+        ("heads.critic_input=all", "`heads.critic_input` must be one of features, complete"),
         ("loss.normalize=year", "`loss.normalize` must be one of entry, step"),
         ("logger.backend=paper", "`logger.backend` must be one of csv, tensorboard"),
         ("loss.normalize_advantage=3", "must be true or false"),

@@ -25,7 +25,8 @@ from agents import (
 )
 from contracts import LossContract
 from tensordict import TensorDict, TensorDictBase
-from torchrl.modules import GRUModule, set_recurrent_mode
+from torch import nn
+from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
@@ -440,6 +441,26 @@ def test_a_filter_with_keys_of_its_own_is_served():
     out = loss(data)
     for key, value in expected.items():
         assert torch.equal(out[key], value), key
+
+
+def test_what_a_head_reads_beside_the_features_is_among_the_in_keys():
+    agent, data = make_belief_agent(), make_data()
+    plain = make_loss(agent)
+    width = agent.critic.module.in_features
+    value = Joined(width + OBS, 1, dtype=torch.float64)
+    critic = ValueOperator(value, in_keys=["features", ("simulator", "state")])
+    loss = DRBPNLoss(agent.belief, ClipPPOLoss(agent.actor, critic), BeliefModelLoss())
+    assert set(loss.in_keys) == {*plain.in_keys, ("simulator", "state")}
+    assert "features" not in loss.in_keys
+    data["simulator", "state"] = torch.randn(*data.shape, OBS, dtype=torch.float64)
+    out = loss(data.select(*loss.in_keys, strict=False))
+    out["loss_critic"].backward()
+    assert value.weight.grad.abs().min() > 0
+
+
+class Joined(nn.Linear):
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        return super().forward(torch.cat(inputs, -1))
 
 
 # --------------------------------------------------------------------------------------- parameters

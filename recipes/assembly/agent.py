@@ -21,24 +21,34 @@ from assembly.beliefs import Belief
 from assembly.settings import HeadSettings, LossSettings
 from torchrl_drbpn import DRBPNLoss
 
+# Written by the environment on request, read by a critic on request, by a policy never.
+COMPLETE = "complete_observation"
+
 
 class Agent(nn.Module):
     """Hold a belief module and the two heads that read its features.
 
+    A critic may see more than the policy, as it is left behind after training (asymmetric
+    actor-critic, [Pinto et al. 2018]). It reads the complete observation beside the features, not
+    in their place: the value of a policy that acts on a belief depends on that belief, and a
+    critic without it is biased [Baisero and Amato 2022].
+
     Args:
         belief: the belief module and what belongs to it.
+        obs_dim: components of an observation.
         action_dim: components of an action.
         heads: sizes and initialisation of the heads.
 
     Attributes:
         belief: the belief module.
         actor: the policy head, a distribution over actions given ``features``.
-        critic: the value head, ``state_value`` given ``features``.
+        critic: the value head, ``state_value`` given ``features`` and, with
+            ``heads.critic_input=complete``, the complete observation.
         policy: belief module, then policy head.
         model_loss: the loss of the belief's own model, or None.
     """
 
-    def __init__(self, belief: Belief, action_dim: int, heads: HeadSettings) -> None:
+    def __init__(self, belief: Belief, obs_dim: int, action_dim: int, heads: HeadSettings) -> None:
         super().__init__()
         self.belief = belief.module
         self.model_loss = belief.model_loss
@@ -54,8 +64,13 @@ class Agent(nn.Module):
             distribution_class=IndependentNormal,
             return_log_prob=True,
         )
-        value = _mlp([*sizes, 1], heads.hidden_gain, heads.value_gain)
-        self.critic = ValueOperator(value, in_keys=["features"])
+        complete = heads.critic_input == "complete"
+        width = belief.feature_dim + (obs_dim if complete else 0)
+        value = _mlp([width, *heads.hidden, 1], heads.hidden_gain, heads.value_gain)
+        self.critic = ValueOperator(
+            _SideBySide(*value) if complete else value,
+            in_keys=["features", COMPLETE] if complete else ["features"],
+        )
         # Not registered a second time: its parts are above.
         self.__dict__["policy"] = TensorDictSequential(self.belief, self.actor)
 
@@ -93,6 +108,17 @@ class Agent(nn.Module):
             functional=False,
         )
 
+    def value(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """Return V of the beliefs that are stored in a rollout.
+
+        Args:
+            tensordict: with what the critic reads, any shape.
+
+        Returns:
+            Values, shape ``(*, 1)``.
+        """
+        return self.critic.module(*(tensordict.get(key) for key in self.critic.in_keys))
+
     @torch.no_grad()
     def next_value(self, next_tensordict: TensorDictBase) -> torch.Tensor:
         """Return V of the beliefs that follow, one step ahead of every stored step.
@@ -107,9 +133,16 @@ class Agent(nn.Module):
         Returns:
             Values, shape ``(*, 1)``.
         """
-        single = next_tensordict.select(*self.belief.in_keys, strict=False)
-        features = self.belief(single.reshape(-1)).get("features")
-        return self.critic.module(features).reshape(*next_tensordict.shape, 1)
+        keys = (*self.belief.in_keys, *self.critic.in_keys)
+        single = next_tensordict.select(*keys, strict=False).reshape(-1)
+        return self.value(self.belief(single)).reshape(*next_tensordict.shape, 1)
+
+
+class _SideBySide(nn.Sequential):
+    """A network of several inputs, joined in their last dimension."""
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        return super().forward(torch.cat(inputs, -1))
 
 
 def _mlp(sizes: list[int], hidden_gain: float, last_gain: float) -> nn.Sequential:

@@ -55,6 +55,7 @@ def make_environment(
     gamma: float,
     seed: int,
     before_normalisation: Sequence[Transform] = (),
+    complete: bool = False,
 ) -> TransformedEnv:
     """Build the batched, corrupted, normalised environment of a run.
 
@@ -68,6 +69,8 @@ def make_environment(
         gamma: discount of the return whose deviation scales the reward.
         seed: seed of episodes and corruption.
         before_normalisation: further transforms that a belief module asks for.
+        complete: whether to write ``complete_observation`` too: what complete, noiseless sensors
+            would have shown, normalised with the same statistics. No policy reads it.
 
     Returns:
         The environment, batch size ``(num_envs,)``. The recurrent state's primer is not in it:
@@ -78,8 +81,10 @@ def make_environment(
     """
     base = _make_base(env, num_envs, num_threads)
     transforms: list[Transform] = [PreviousAction()]
-    if noise.sigma > 0:
-        transforms.append(ObservationNoise(noise.scale * noise.sigma))
+    # The first transform that corrupts writes down what it was given.
+    key, noisy = "complete_observation" if complete else None, noise.sigma > 0
+    if noisy:
+        transforms.append(ObservationNoise(noise.scale * noise.sigma, complete_key=key))
     # "none" still writes `observed`: every entry is there.
     none = missingness.mechanism == "none"
     transforms += [
@@ -88,6 +93,7 @@ def make_environment(
             0.0 if none else missingness.eta,
             always_observed=missingness.always_observed,
             mechanism_seed=missingness.mechanism_seed,
+            complete_key=None if noisy else key,
         ),
         *before_normalisation,
         MaskedObservationNorm(clip=normalisation.observation_clip),

@@ -22,7 +22,7 @@ def add_advantages(data: TensorDictBase, agent: Agent, gae: GAE) -> None:
         agent: whose critic values the beliefs; its parameters are those that collected the rollout.
         gae: TorchRL's estimator, built without a network.
     """
-    data.set("state_value", agent.critic.module(data.get("features")))
+    data.set("state_value", agent.value(data))
     following = data.get("next")
     following.set("state_value", agent.next_value(following))
     gae(data)

@@ -34,6 +34,7 @@ _PACKAGES = (
 # did: a folder stays readable when a setting is added. "group.key": value
 _LATER_SETTINGS: dict[str, Any] = {
     "algo": {"_target_": "assembly.algorithms.ppo.build", "name": "ppo"},
+    "heads.critic_input": "features",
 }
 
 

@@ -66,6 +66,7 @@ class HeadSettings:
     policy_gain: float
     value_gain: float
     log_std: float
+    critic_input: str
 
 
 @dataclass(frozen=True)
@@ -237,6 +238,7 @@ def _check(s: Settings) -> None:
         "env.backend": (s.env.backend, ("gymnasium", "envpool")),
         "env.version": (s.env.version, ("v4", "v5")),
         "missingness.mechanism": (s.missingness.mechanism, ("none", "mcar", "mar", "nmar")),
+        "heads.critic_input": (s.heads.critic_input, ("features", "complete")),
         "loss.loss_critic_type": (s.loss.loss_critic_type, ("l1", "l2", "smooth_l1")),
         "loss.normalize": (s.loss.normalize, ("entry", "step")),
         "logger.backend": (s.logger.backend, ("csv", "tensorboard")),

@@ -12,7 +12,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.objectives.value import GAE
 
-from assembly.agent import Agent, add_primers
+from assembly.agent import COMPLETE, Agent, add_primers
 from assembly.algorithms import Algorithm, build_algorithm
 from assembly.beliefs import Belief, build_belief
 from assembly.environment import make_environment, task_dims
@@ -86,6 +86,7 @@ def assemble(settings: Settings) -> Training:
         gamma=settings.loss.gamma,
         seed=settings.seed,
         before_normalisation=belief.transforms(),
+        complete=COMPLETE in agent.critic.in_keys,
     )
     add_primers(env, agent)
     collector = Collector(
@@ -126,7 +127,7 @@ def make_agent(settings: Settings) -> tuple[Belief, Agent]:
         action_dim=action_dim,
         normalize=settings.loss.normalize,
     )
-    return belief, Agent(belief, action_dim, settings.heads)
+    return belief, Agent(belief, obs_dim, action_dim, settings.heads)
 
 
 def train_rollout(

@@ -146,14 +146,19 @@ class DRBPNLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Entries read: the belief module's, its next step's, and those of PPO."""
+        """Entries read: the belief module's, its next step's, the heads' own, those of PPO."""
         keys = self.tensor_keys
         belief = list(self.filter_network.in_keys)
         following = [unravel_key(("next", key)) for key in belief]
         written = {unravel_key(key) for key in self.filter_network.out_keys}
+        actor, critic = self.ppo_loss.actor_network, self.ppo_loss.critic_network
+        # A head may read more than features, as a critic that sees what the actor does not.
+        heads = [key for head in (actor, critic) if head is not None for key in head.in_keys]
+        made = written | {unravel_key(key) for key in actor.out_keys}
         read = [
             *belief,
             *(key for key in following if key not in written),
+            *(key for key in map(unravel_key, heads) if key not in made),
             keys.done,
             keys.final,
             keys.action,
