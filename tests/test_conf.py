@@ -27,7 +27,11 @@ from assembly.settings import EnvSettings, read_settings  # noqa: E402
 from hydra import compose, initialize_config_dir  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
 
-CHOICES = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml") if path.is_file())
+CHOICES = sorted(
+    (path.parent.name, path.stem)
+    for path in CONF.glob("*/*.yaml")
+    if path.parent.name != "study"  # of another job: tests/test_study.py
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,9 +65,16 @@ def test_the_evaluation_configuration_composes() -> None:
     assert compose("evaluate", ["run=somewhere"]).episodes == 30
 
 
+def _choices(path: Path) -> list[str]:
+    axes = OmegaConf.to_container(OmegaConf.load(path))["axes"]
+    return [str(choice) for choices in axes.values() for choice in choices]
+
+
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)
 def test_every_default_is_explained_on_its_line_or_above(path: Path) -> None:
     structure = ("defaults:", "hydra:", "_target_:", "name:", "- ")
+    if path.parent.name == "study":  # the names of an axis are the user's
+        structure += tuple(f"{name}: [" for name in _choices(path))
     if path.parent.name == "experiment":  # an overlay says what it is for at its head
         assert "# " in path.read_text().splitlines()[1]
         return

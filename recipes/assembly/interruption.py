@@ -12,9 +12,13 @@ class StopRequest:
 
     The first signal is remembered and nothing else happens, so that the run stops where its state
     is whole: after the update of the current rollout. A second one ends the process as usual.
+
+    Args:
+        patient: whether a second one is ignored instead.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, patient: bool = False) -> None:
+        self.patient = patient
         self.signal: int | None = None
         self._before: dict[int, Any] = {}
 
@@ -45,7 +49,8 @@ class StopRequest:
     def _remember(self, number: int, frame: FrameType | None) -> None:
         del frame
         self.signal = number
-        self._restore()
+        if not self.patient:
+            self._restore()
 
     def _restore(self) -> None:
         while self._before:

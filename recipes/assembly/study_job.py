@@ -97,7 +97,8 @@ class StudyJob:
         """
         self._report()
         reported = time.monotonic()
-        with StopRequest() as stop:
+        # Its runs would go on by themselves if this process ended before it has asked them.
+        with StopRequest(patient=True) as stop:
             while not stop and (self._queue or self._own or self._found):
                 while self._queue and len(self._own) + len(self._found) < self.at_once:
                     self._start(self._queue.pop(0))
@@ -179,7 +180,7 @@ class StudyJob:
 
     def _stop(self) -> None:
         """Ask every run once to save and leave, and wait for it."""
-        say(f"stopping: {len(self._own) + len(self._found)} runs save and leave")
+        say(f"stopping: {len(self._own) + len(self._found)} runs save and leave, in seconds")
         numbers = [process.pid for process in self._own.values()]
         numbers += [n for n in map(self.folder.process_of, self._found.values()) if n is not None]
         for number in numbers:
