@@ -4,6 +4,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from torchrl_drbpn import functional
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
+from torchrl_drbpn.functional import select_sensors
 from torchrl_drbpn.modules import (
     BeliefDivergedError,
     BeliefFilter,
@@ -55,4 +56,5 @@ __all__ = [
     "SensorReduction",
     "functional",
     "seed_env",
+    "select_sensors",
 ]

@@ -42,6 +42,7 @@ from torchrl_drbpn.functional.particles import (
     systematic_ancestors,
 )
 from torchrl_drbpn.functional.recurrence import MeanNetwork
+from torchrl_drbpn.functional.selection import SensorSelection, select_sensors
 
 __all__ = [
     "Belief",
@@ -54,6 +55,7 @@ __all__ = [
     "ParticleNoise",
     "ParticleOutput",
     "Prospect",
+    "SensorSelection",
     "StateSpace",
     "choose_form",
     "count_always_observed",
@@ -79,6 +81,7 @@ __all__ = [
     "resample",
     "sample_noise",
     "sample_observed",
+    "select_sensors",
     "systematic_ancestors",
     "tril_to_vector",
     "update",

@@ -1,0 +1,422 @@
+"""Choosing sensors by H, P and R.
+
+Specified: the values of both criteria are those of the covariance that `functional.update` leaves
+with the chosen rows; greedy picks the best next sensor, equals exhaustive search where sensors do
+not share what they say, and stays within 1 - 1/e of it on random problems with a diagonal R, which
+the information is submodular on; a full R and the trace are not submodular. Nothing depends on the
+order in which sensors are listed or, for D, on the basis of the state. The exhaustive truth is a
+loop over all subsets with rows deleted, sharing no code with the package.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import oracles
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_drbpn import functional, select_sensors
+from torchrl_drbpn.functional import Belief
+
+DOUBLE = torch.float64
+BOUND = 1 - 1 / math.e
+
+
+# The truth ------------------------------------------------------------------------------------
+
+
+def posterior(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> Tensor:
+    """P+ in information form, P^-1 + H_S' R_SS^-1 H_S inverted: rows deleted, nothing masked."""
+    if not rows:
+        return P
+    Hs, Rs = H[rows], R[rows][:, rows]
+    return torch.linalg.inv(torch.linalg.inv(P) + Hs.T @ torch.linalg.solve(Rs, Hs))
+
+
+def information(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> float:
+    """I(s; x_S) = 1/2 log det(I + R_SS^-1 H_S P H_S'), nats."""
+    Hs, Rs = H[rows], R[rows][:, rows]
+    inner = torch.eye(len(rows), dtype=DOUBLE) + torch.linalg.solve(Rs, Hs @ P @ Hs.T)
+    return 0.5 * float(torch.linalg.slogdet(inner).logabsdet)
+
+
+def criterion_value(criterion: str, cov: Tensor) -> float:
+    return float(torch.linalg.slogdet(cov).logabsdet if criterion == "D" else cov.trace())
+
+
+def exhaustive(
+    criterion: str, H: Tensor, P: Tensor, R: Tensor, count: int, always: tuple[int, ...] = ()
+) -> tuple[tuple[int, ...], float]:
+    """The best set of that size, the first in lexical order among equals, and its value."""
+    free = [i for i in range(len(H)) if i not in always]
+    values = {
+        rows: criterion_value(criterion, posterior(H, P, R, [*always, *rows]))
+        for rows in itertools.combinations(free, count)
+    }
+    best = min(values.values())
+    return next(rows for rows, value in values.items() if value <= best + 1e-10), best
+
+
+def problem(seed: int, obs: int = 7, state: int = 4, full: bool = False):
+    """A random sensor model: H, P full, R diagonal or full."""
+    g = torch.Generator().manual_seed(seed)
+    H = torch.randn(obs, state, generator=g, dtype=DOUBLE)
+    R = oracles.spd(obs, g) if full else (0.05 + torch.rand(obs, generator=g, dtype=DOUBLE)).diag()
+    return H, oracles.spd(state, g), R
+
+
+def updated(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> Tensor:
+    """The covariance that the library's own update leaves with these rows observed."""
+    observed = torch.zeros(len(H), dtype=torch.bool)
+    observed[rows] = True
+    belief = Belief(torch.zeros(len(P), dtype=DOUBLE), P)
+    return functional.update(belief, torch.zeros(len(H), dtype=DOUBLE), observed, H, R).cov
+
+
+SHAPES = [pytest.param(6, 3, id="obs>state"), pytest.param(4, 6, id="obs<state")]
+
+
+# Values ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("always", [(), (2, 0)], ids=["alone", "beside others"])
+@pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
+@pytest.mark.parametrize("criterion", ["D", "A"])
+@pytest.mark.parametrize(("obs", "state"), SHAPES)
+def test_objective_and_information_are_those_of_update_on_the_chosen_rows(
+    obs, state, criterion, full, always
+):
+    H, P, R = problem(3, obs, state, full)
+    count = obs - len(always)
+    chosen = select_sensors(H, P, R, count, criterion=criterion, always=always)
+    before = criterion_value("D", updated(H, P, R, [*always]))
+    for k in range(count):
+        rows = [*always, *chosen.indices[: k + 1].tolist()]
+        cov = updated(H, P, R, rows)
+        assert chosen.objective[k] == pytest.approx(criterion_value(criterion, cov), abs=1e-10)
+        gained = 0.5 * (before - criterion_value("D", cov))
+        assert chosen.information[k] == pytest.approx(gained, abs=1e-10)
+
+
+def test_with_nothing_there_before_the_information_is_the_mutual_information():
+    for full in (False, True):
+        H, P, R = problem(5, full=full)
+        chosen = select_sensors(H, P, R, 5)
+        expected = [information(H, P, R, chosen.indices[:k].tolist()) for k in range(1, 6)]
+        torch.testing.assert_close(
+            chosen.information, torch.tensor(expected, dtype=DOUBLE), rtol=0, atol=1e-10
+        )
+
+
+def test_one_sensor_in_closed_form():
+    """I = 1/2 log(1 + h P h' / r) and tr P+ = tr P - |P h|^2 / (h P h' + r)."""
+    H, P, R = problem(1, obs=1)
+    h, r = H[0], R[0, 0]
+    signal = h @ P @ h
+    chosen = select_sensors(H, P, R, 1, criterion="A")
+    torch.testing.assert_close(chosen.information[0], 0.5 * torch.log1p(signal / r))
+    torch.testing.assert_close(
+        chosen.objective[0], P.trace() - (P @ h).square().sum() / (signal + r)
+    )
+
+
+def test_the_same_sensor_n_times_over_is_one_with_an_nth_of_the_noise():
+    chosen = select_sensors(
+        torch.ones(4, 1), torch.full((1, 1), 3.0), torch.full((4,), 0.5), 4, criterion="A"
+    )
+    n = torch.arange(1, 5, dtype=DOUBLE)
+    torch.testing.assert_close(chosen.objective, 1 / (1 / 3 + n / 0.5))
+    torch.testing.assert_close(chosen.information, 0.5 * torch.log1p(n * 3 / 0.5))
+    assert chosen.indices.tolist() == [0, 1, 2, 3]
+
+
+def test_the_trace_is_that_of_the_target():
+    H, P, R = problem(2)
+    C = torch.randn(2, 4, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+    chosen = select_sensors(H, P, R, 3, criterion="A", target=C)
+    for k in range(3):
+        cov = posterior(H, P, R, chosen.indices[: k + 1].tolist())
+        assert chosen.objective[k] == pytest.approx(float((C @ cov @ C.T).trace()), abs=1e-10)
+    # A direction that no target holds is worth nothing.
+    only_first = select_sensors(
+        torch.eye(3), torch.diag(torch.tensor([1.0, 9.0, 9.0])), torch.ones(3), 1,
+        criterion="A", target=torch.eye(3)[:1],
+    )  # fmt: skip
+    assert only_first.indices.tolist() == [0]
+
+
+# Choice ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("always", [(), (4, 1)], ids=["alone", "beside others"])
+@pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
+@pytest.mark.parametrize("criterion", ["D", "A"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_every_pick_is_the_best_next_one(seed, criterion, full, always):
+    H, P, R = problem(seed, full=full)
+    chosen = select_sensors(H, P, R, 4, criterion=criterion, always=always).indices.tolist()
+    for k, pick in enumerate(chosen):
+        before = [*always, *chosen[:k]]
+        values = {
+            i: criterion_value(criterion, posterior(H, P, R, [*before, i]))
+            for i in range(len(H))
+            if i not in before
+        }
+        assert pick == min(values, key=values.__getitem__)
+
+
+@pytest.mark.parametrize("criterion", ["D", "A"])
+@pytest.mark.parametrize("seed", range(4))
+def test_greedy_equals_exhaustive_where_each_sensor_reads_a_direction_of_its_own(seed, criterion):
+    """H an orthogonal matrix that diagonalises P: readings share nothing, gains add up."""
+    g = torch.Generator().manual_seed(seed)
+    H = torch.linalg.qr(torch.randn(6, 6, generator=g, dtype=DOUBLE)).Q
+    P = H.T @ (0.1 + torch.rand(6, generator=g, dtype=DOUBLE)).diag() @ H
+    R = (0.1 + torch.rand(6, generator=g, dtype=DOUBLE)).diag()
+    for count in range(1, 7):
+        chosen = select_sensors(H, P, R, count, criterion=criterion)
+        best, value = exhaustive(criterion, H, P, R, count)
+        assert sorted(chosen.indices.tolist()) == list(best)
+        assert chosen.objective[-1] == pytest.approx(value, abs=1e-10)
+
+
+@pytest.mark.parametrize("always", [(), (3,)], ids=["alone", "beside others"])
+@pytest.mark.parametrize("seed", range(12))
+def test_greedy_information_is_within_its_bound_of_the_best_set(seed, always):
+    H, P, R = problem(seed)
+    start = information(H, P, R, [*always])
+    shares = []
+    for count in (2, 3, 4):
+        greedy = float(select_sensors(H, P, R, count, always=always).information[-1])
+        best = information(H, P, R, [*always, *exhaustive("D", H, P, R, count, always)[0]]) - start
+        shares.append(greedy / best)
+    assert all(BOUND <= share <= 1 + 1e-10 for share in shares)
+
+
+def test_greedy_is_not_always_the_best_set():
+    """Sensor 0 alone tells most, but 1 and 2 together tell more than 0 with either."""
+    H = torch.tensor([[1.0, 1.0], [1.0, 0.0], [0.0, 1.0]], dtype=DOUBLE)
+    P, R = torch.eye(2, dtype=DOUBLE), torch.diag(torch.tensor([0.5, 0.3, 0.3], dtype=DOUBLE))
+    assert select_sensors(H, P, R, 2).indices.tolist()[0] == 0
+    best, value = exhaustive("D", H, P, R, 2)
+    assert best == (1, 2)
+    assert select_sensors(H, P, R, 2).objective[-1] > value
+
+
+# What the guarantee rests on ------------------------------------------------------------------
+
+
+def gains(H: Tensor, P: Tensor, R: Tensor, criterion: str) -> list[tuple[float, float]]:
+    """Gain of a sensor beside a set and beside that set with one more, for all such triples."""
+
+    def reached(rows: tuple[int, ...]) -> float:
+        return -criterion_value(criterion, posterior(H, P, R, list(rows)))
+
+    found = []
+    for size in range(len(H) - 1):
+        for rows in itertools.combinations(range(len(H)), size):
+            rest = [i for i in range(len(H)) if i not in rows]
+            for extra, sensor in itertools.permutations(rest, 2):
+                small = reached((*rows, sensor)) - reached(rows)
+                large = reached((*rows, extra, sensor)) - reached((*rows, extra))
+                found.append((small, large))
+    return found
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_information_has_diminishing_returns_under_a_diagonal_noise(seed):
+    found = gains(*problem(seed, obs=4, state=3), "D")
+    assert all(0 <= large <= small + 1e-9 for small, large in found)
+
+
+def test_information_grows_but_not_with_diminishing_returns_under_a_full_noise():
+    """Sensor 1 reads nothing but the noise of sensor 0, nearly."""
+    H = torch.tensor([[1.0], [0.0]], dtype=DOUBLE)
+    P, R = torch.ones(1, 1, dtype=DOUBLE), torch.tensor([[1.0, 0.9], [0.9, 1.0]], dtype=DOUBLE)
+    found = gains(H, P, R, "D")
+    assert all(large >= -1e-12 for _, large in found)
+    assert any(large > small + 0.1 for small, large in found)
+    chosen = select_sensors(H, P, R, 2)
+    assert chosen.indices.tolist() == [0, 1]
+    assert chosen.information.diff(prepend=torch.zeros(1)).diff() > 0
+
+
+def test_the_trace_falls_but_not_with_diminishing_returns():
+    found = [pair for seed in range(6) for pair in gains(*problem(seed, 3, 3), "A")]
+    assert all(large >= -1e-12 for _, large in found)
+    assert any(large > small + 1e-3 for small, large in found)
+
+
+@pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
+@pytest.mark.parametrize("criterion", ["D", "A"])
+def test_more_sensors_never_leave_more_uncertainty(criterion, full):
+    chosen = select_sensors(*problem(7, 9, 5, full), 9, criterion=criterion)
+    assert bool((chosen.objective.diff() <= 0).all())
+    assert bool((chosen.information.diff(prepend=torch.zeros(1)) >= 0).all())
+    assert sorted(chosen.indices.tolist()) == list(range(9))
+
+
+# Invariances ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_d_does_not_depend_on_the_basis_of_the_state(seed, full):
+    H, P, R = problem(seed, full=full)
+    T = torch.randn(4, 4, generator=torch.Generator().manual_seed(seed + 50), dtype=DOUBLE)
+    ours = select_sensors(H, P, R, 5)
+    theirs = select_sensors(H @ torch.linalg.inv(T), T @ P @ T.T, R, 5)
+    assert torch.equal(ours.indices, theirs.indices)
+    torch.testing.assert_close(ours.information, theirs.information, rtol=0, atol=1e-9)
+    shift = 2 * torch.linalg.slogdet(T).logabsdet
+    torch.testing.assert_close(ours.objective + shift, theirs.objective, rtol=0, atol=1e-9)
+
+
+def test_a_depends_on_the_basis_of_the_state_unless_the_target_moves_along():
+    H, P, R = torch.eye(2), torch.eye(2), torch.tensor([0.4, 0.5])
+    T = torch.diag(torch.tensor([1.0, 3.0]))
+    moved = H @ torch.linalg.inv(T), T @ P @ T.mT, R
+    assert select_sensors(H, P, R, 1, criterion="A").indices.tolist() == [0]
+    assert select_sensors(*moved, 1, criterion="A").indices.tolist() == [1]
+    assert select_sensors(*moved, 1, criterion="A", target=moved[0]).indices.tolist() == [0]
+
+
+@pytest.mark.parametrize("criterion", ["D", "A"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_listing_the_sensors_in_another_order_chooses_the_same_ones(seed, criterion):
+    H, P, R = problem(seed, full=True)
+    order = torch.randperm(7, generator=torch.Generator().manual_seed(seed))
+    ours = select_sensors(H, P, R, 5, criterion=criterion, always=[order[0]])
+    theirs = select_sensors(H[order], P, R[order][:, order], 5, criterion=criterion, always=[0])
+    assert torch.equal(ours.indices, order[theirs.indices])
+    torch.testing.assert_close(ours.objective, theirs.objective)
+
+
+def test_scaling_a_reading_changes_nothing():
+    H, P, R = problem(4, full=True)
+    scale = torch.linspace(0.01, 50, 7, dtype=DOUBLE)
+    theirs = select_sensors(scale[:, None] * H, P, scale[:, None] * R * scale, 6)
+    ours = select_sensors(H, P, R, 6)
+    assert torch.equal(ours.indices, theirs.indices)
+    torch.testing.assert_close(ours.information, theirs.information)
+
+
+def test_ties_go_to_the_lowest_index_though_rounding_tells_them_apart():
+    """Three copies of a rotated orthogonal frame: every gain is equal in exact arithmetic."""
+    g = torch.Generator().manual_seed(0)
+    frame = torch.linalg.qr(torch.randn(5, 5, generator=g, dtype=DOUBLE)).Q
+    H = torch.cat([frame, -frame, frame])
+    for criterion in ("D", "A"):
+        chosen = select_sensors(H, torch.eye(5), torch.ones(15), 15, criterion=criterion)
+        assert chosen.indices.tolist() == list(range(15))
+
+
+def test_a_longer_selection_begins_with_the_shorter_one():
+    H, P, R = problem(6)
+    short, whole = select_sensors(H, P, R, 3), select_sensors(H, P, R, 7)
+    for a, b in zip(short, whole, strict=True):
+        assert torch.equal(a, b[:3])
+
+
+# Shapes, types ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("criterion", ["D", "A"])
+def test_a_batch_is_a_loop(criterion):
+    cases = [problem(seed, full=True) for seed in range(6)]
+    H, P, R = (torch.stack(x).unflatten(0, (2, 3)) for x in zip(*cases, strict=True))
+    whole = select_sensors(H, P, R, 4, criterion=criterion, always=[5])
+    for index, case in enumerate(cases):
+        alone = select_sensors(*case, 4, criterion=criterion, always=[5])
+        at = divmod(index, 3)
+        assert torch.equal(whole.indices[at], alone.indices)
+        torch.testing.assert_close(whole.objective[at], alone.objective)
+        torch.testing.assert_close(whole.information[at], alone.information)
+    # One H and R for many covariances, as a filter has them.
+    one = select_sensors(cases[0][0], P, cases[0][2], 2)
+    assert one.indices.shape == (2, 3, 2)
+
+
+def test_variances_are_a_diagonal_matrix_and_a_bool_vector_is_a_list_of_indices():
+    H, P, R = problem(8)
+    there = torch.tensor([False, True, False, False, False, True, False])
+    first = select_sensors(H, P, R.diagonal(), 3, always=there)
+    for always in ([5, 1], [1, -2, 5], torch.tensor([1, 5])):
+        again = select_sensors(H, P, R, 3, always=always)
+        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_float32_parameters_are_read_in_float64_and_need_no_gradient():
+    H, P, R = (x.float().requires_grad_() for x in problem(9))
+    chosen = select_sensors(H, P, R, 3)
+    wide = select_sensors(H.double(), P.double(), R.double(), 3)
+    assert chosen.objective.dtype == chosen.information.dtype == DOUBLE
+    assert chosen.indices.dtype == torch.int64
+    assert not chosen.objective.requires_grad
+    assert torch.equal(chosen.objective, wide.objective)
+
+
+def test_no_sensors_are_an_empty_choice():
+    chosen = select_sensors(*problem(0), 0)
+    assert [tuple(x.shape) for x in chosen] == [(0,)] * 3
+
+
+def test_it_is_accurate_at_the_noise_floor():
+    """R std 1e-2 against P std 1e2: gains of 9 nats and variances of 1e-4 beside 1e4."""
+    H, P, _ = problem(2, 6, 6)
+    P, R = 1e4 * P, torch.full((6,), 1e-4, dtype=DOUBLE)
+    for criterion in ("D", "A"):
+        chosen = select_sensors(H, P, R, 6, criterion=criterion)
+        cov = posterior(H, P, R.diag(), chosen.indices.tolist())
+        assert chosen.information[-1] == pytest.approx(
+            information(H, P, R.diag(), chosen.indices.tolist()), rel=1e-9
+        )
+        assert chosen.objective[-1] == pytest.approx(criterion_value(criterion, cov), rel=1e-5)
+
+
+# Bad input --------------------------------------------------------------------------------------
+
+EYE = torch.eye(3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"emission_matrix": torch.ones(3)}, r"`emission_matrix` must be H of shape.*got \(3,\)"),
+        ({"emission_matrix": EYE * torch.nan}, "`emission_matrix` holds NaN or inf"),
+        ({"predicted_cov": torch.eye(2)}, r"`predicted_cov` must be of shape.*state=3.*\(2, 2\)"),
+        ({"predicted_cov": EYE.clone().fill_(1.0)}, "`predicted_cov` must be positive definite"),
+        ({"predicted_cov": EYE + EYE.roll(1, 0)}, "`predicted_cov` must be symmetric and finite"),
+        ({"predicted_cov": EYE * torch.inf}, "`predicted_cov` must be symmetric and finite"),
+        ({"emission_cov": torch.ones(2)}, r"`emission_cov` must be of shape.*obs=3.*got \(2,\)"),
+        ({"emission_cov": torch.tensor([1.0, 0, 1])}, "`emission_cov` must hold variances above 0"),
+        ({"emission_cov": -EYE}, "`emission_cov` must be positive definite"),
+        (
+            {"emission_matrix": torch.ones(2, 3, 3), "predicted_cov": EYE.expand(4, 3, 3)},
+            r"must have batch shapes that broadcast, got \(2,\), \(4,\), \(\)",
+        ),
+        ({"count": 4}, "`count` must be an int from 0 to 3, .*got 4"),
+        ({"count": 3, "always": [0]}, "`count` must be an int from 0 to 2, .*got 3"),
+        ({"count": -1}, "`count` must be an int from 0"),
+        ({"count": 1.0}, "`count` must be an int from 0"),
+        ({"count": True}, "`count` must be an int from 0"),
+        ({"criterion": "E"}, "`criterion` must be 'D' .* or 'A' .*got 'E'"),
+        ({"always": [3]}, r"`always` must hold indices from -3 to 2, got \[3\]"),
+        ({"always": [True, False]}, "`always` as bool must have one entry per sensor, 3, got 2"),
+        ({"always": [0.5]}, "`always` must be a list of indices or a bool vector"),
+        ({"target": EYE}, "`target` weighs the trace: it needs criterion='A'"),
+        ({"criterion": "A", "target": torch.eye(2)}, "`target` must be finite and of shape"),
+        (
+            {"criterion": "A", "target": EYE.expand(2, 3, 3)},
+            r"`target` must have the batch shape \(\) of the model or none, got \(2,\)",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_input_is_answered_with_one_line(changes, message):
+    given = {"emission_matrix": EYE, "predicted_cov": EYE, "emission_cov": EYE, "count": 1}
+    with pytest.raises(ValueError, match=message) as caught:
+        select_sensors(**(given | changes))
+    assert "\n" not in str(caught.value)
