@@ -3,8 +3,10 @@
 MCAR: every entry missing with probability eta. MAR and NMAR: P(missing_i) = min(sigmoid(b1_i . a +
 b2_i . x + b0_i), eta), x being the always observed entries (MAR) or all (NMAR); 0 for the always
 observed ones. The oracle is that sentence as a loop over entries. Realised ratios lie within a few
-standard errors, sqrt(p (1 - p) / n), of the law. Randomness comes from the generator passed in
-alone.
+standard errors, sqrt(p (1 - p) / n), of the law. Outages: a two-state Markov chain, whose runs are
+geometric with the given mean and whose share of time off is eta, from the first step on. Spikes: an
+entry is hit with its probability and its error has the given deviation. Randomness comes from the
+generator passed in alone.
 """
 
 from __future__ import annotations
@@ -18,8 +20,11 @@ from torchrl_drbpn.functional.corruption import (
     count_always_observed,
     draw_mechanism,
     missing_probability,
+    outage_rates,
     sample_noise,
     sample_observed,
+    sample_spikes,
+    sample_working,
 )
 
 OBS, ACTION = 9, 3
@@ -204,6 +209,119 @@ def test_one_number_is_the_same_number_for_every_component():
     assert torch.equal(one, sample_noise(torch.full((3,), 0.2), like, seeded(9)))
 
 
+# ------------------------------------------------------------------------------- outages that last
+def chain(eta, mean_length, steps, sensors, seed=0):
+    """Return which sensors work, shape (steps, sensors), from the stationary start."""
+    rates, generator = outage_rates(eta, mean_length), seeded(seed)
+    like = torch.zeros(sensors)
+    rows = [sample_working(None, rates, like, generator)]
+    for _ in range(steps - 1):
+        rows.append(sample_working(rows[-1], rates, like, generator))
+    return torch.stack(rows)
+
+
+def runs_of(column, value):
+    """Return the lengths of the whole runs of `value`: those cut by an end are left out."""
+    lengths, current, started = [], 0, False
+    for entry in column.tolist():
+        if entry == value:
+            current += 1
+        else:
+            if current and started:
+                lengths.append(current)
+            current, started = 0, True
+    return lengths
+
+
+@pytest.mark.parametrize(
+    ("eta", "mean_length"),
+    [(0.2, 1.0), (0.2, 5.0), (0.5, 1.0), (0.5, 20.0), (0.8, 4.0), (0.0, 3.0)],
+)
+def test_outage_rates_have_the_given_ratio_and_mean_length(eta, mean_length):
+    rates = outage_rates(eta, mean_length)
+    assert 1 / rates.repair == pytest.approx(mean_length)
+    assert rates.missing_rate == pytest.approx(eta)
+    # detailed balance: as many sensors fail as come back
+    assert (1 - eta) * rates.failure == pytest.approx(eta * rates.repair)
+
+
+@pytest.mark.parametrize(("eta", "mean_length"), [(0.5, 5.0), (0.2, 3.0)])
+def test_outages_last_a_geometric_number_of_steps(eta, mean_length):
+    working = chain(eta, mean_length, 3000, 20)
+    for value, mean in ((False, mean_length), (True, mean_length * (1 - eta) / eta)):
+        runs = torch.tensor(
+            [n for column in working.T for n in runs_of(column, value)], dtype=torch.float64
+        )
+        # geometric on 1, 2, ... with success 1/mean: variance mean (mean - 1)
+        error = math.sqrt(mean * (mean - 1) / len(runs))
+        assert abs(runs.mean() - mean) < 4 * error
+        for length in (1, 2, 5):
+            law = (1 - 1 / mean) ** (length - 1) / mean
+            share = (runs == length).double().mean()
+            assert abs(share - law) < 4 * math.sqrt(law * (1 - law) / len(runs)), length
+
+
+@pytest.mark.parametrize("mean_length", [1.0, 5.0, 50.0])
+def test_every_step_of_the_chain_misses_eta_from_the_first_on(mean_length):
+    working = chain(0.4, mean_length, 30, 20_000)
+    missing = 1 - working.double().mean(1)
+    assert ((missing - 0.4).abs() < 4.5 * math.sqrt(0.4 * 0.6 / 20_000)).all()
+
+
+def test_outages_of_mean_length_1_over_1_minus_eta_have_no_memory():
+    rates = outage_rates(0.75, 4.0)
+    assert rates.failure == pytest.approx(1 - rates.repair)  # the same whether on or off
+    strict = chain(0.5, 1.0, 10, 50)
+    assert (strict[1:] == ~strict[:-1]).all()  # the shortest possible: on and off in turn
+
+
+def test_sensors_fail_independently_of_each_other():
+    missing = 1 - chain(0.5, 2.0, 20_000, 4).double()
+    correlation = torch.corrcoef(missing.T) - torch.eye(4)
+    assert correlation.abs().max() < 4 / math.sqrt(20_000)
+
+
+@pytest.mark.parametrize(
+    ("eta", "mean_length", "what"),
+    [
+        (1.0, 5, r"`eta` must be a share of time in \[0, 1\), got 1.0"),
+        (-0.1, 5, "`eta` must be a share"),
+        (math.nan, 5, "`eta` must be a share"),
+        (0.5, 0.9, "`mean_length` must be the mean length of an outage in steps, at least 1"),
+        (0.5, math.inf, "`mean_length` must be the mean length"),
+        (0.8, 3.9, r"`mean_length` must be at least eta / \(1 - eta\) = 4 steps for eta 0.8"),
+    ],
+)
+def test_outages_that_no_chain_has_are_refused(eta, mean_length, what):
+    with pytest.raises(ValueError, match=what):
+        outage_rates(eta, mean_length)
+
+
+# ---------------------------------------------------------------------------------------- spikes
+def test_spikes_hit_with_their_probability_and_have_their_deviation():
+    probability = torch.tensor([0.0, 0.05, 1.0])
+    std = torch.tensor([3.0, 20.0, 0.5], dtype=torch.float64)
+    like = torch.zeros(40_000, 3, dtype=torch.float64)
+    error, hit = sample_spikes(probability, std, like, seeded(8))
+    assert error.dtype == torch.float64
+    assert torch.equal(error != 0, hit)
+    share = hit.double().mean(0)
+    assert (
+        (share - probability).abs() <= 4 * (probability * (1 - probability) / 40_000).sqrt()
+    ).all()
+    for i in (1, 2):
+        values = error[hit[:, i], i]
+        assert abs(values.mean()) < 4 * std[i] / math.sqrt(len(values))
+        assert abs(values.std() - std[i]) < 4 * std[i] / math.sqrt(2 * len(values))
+
+
+def test_the_same_readings_are_hit_whatever_the_dtype_and_the_deviation():
+    like = torch.zeros(50, OBS)
+    _, first = sample_spikes(0.2, 5.0, like, seeded(6))
+    _, second = sample_spikes(0.2, 9.0, like.double(), seeded(6))
+    assert torch.equal(first, second)
+
+
 def test_the_global_generator_is_neither_read_nor_advanced():
     x, action = example()
     results = []
@@ -213,7 +331,12 @@ def test_the_global_generator_is_neither_read_nor_advanced():
         drawn, generator = mechanism("nmar"), seeded()
         probability = missing_probability(drawn, x, action, 0.5)
         results.append(
-            (sample_observed(probability, x, generator), sample_noise(1.0, x, generator))
+            (
+                sample_observed(probability, x, generator),
+                sample_noise(1.0, x, generator),
+                sample_working(None, outage_rates(0.5, 5), x, generator),
+                *sample_spikes(0.5, 1.0, x, generator),
+            )
         )
         assert torch.equal(torch.get_rng_state(), state)
     assert all(map(torch.equal, *results))

@@ -2,11 +2,15 @@
 
 from torchrl_drbpn.functional.corruption import (
     MissingnessMechanism,
+    OutageRates,
     count_always_observed,
     draw_mechanism,
     missing_probability,
+    outage_rates,
     sample_noise,
     sample_observed,
+    sample_spikes,
+    sample_working,
 )
 from torchrl_drbpn.functional.filtering import (
     FilterOutput,
@@ -50,6 +54,7 @@ __all__ = [
     "FilterOutput",
     "MeanNetwork",
     "MissingnessMechanism",
+    "OutageRates",
     "Outcome",
     "ParticleModel",
     "ParticleNoise",
@@ -73,6 +78,7 @@ __all__ = [
     "masked_cov",
     "masked_log_density",
     "missing_probability",
+    "outage_rates",
     "particle_sequence",
     "particle_step",
     "positive_std",
@@ -81,6 +87,8 @@ __all__ = [
     "resample",
     "sample_noise",
     "sample_observed",
+    "sample_spikes",
+    "sample_working",
     "select_sensors",
     "systematic_ancestors",
     "tril_to_vector",

@@ -3,6 +3,7 @@
 Eq. (2) [DRBPN]: noise falls on the state of the simulator, then entries of the noisy complete
 observation go missing, completely at random (MCAR), at random given what always arrives (MAR), or
 not at random (NMAR). The terms are those of Rubin, "Inference and missing data", Biometrika 1976.
+Beyond the paper: outages that last, and readings that arrive but are grossly wrong.
 """
 
 from __future__ import annotations
@@ -181,3 +182,121 @@ def sample_noise(std: Tensor | float, like: Tensor, generator: torch.Generator) 
     """
     noise = torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
     return noise.mul_(std)
+
+
+# ------------------------------------------------------------------------------- outages that last
+class OutageRates(NamedTuple):
+    """The two transition probabilities of a sensor that fails and comes back.
+
+    Attributes:
+        failure: P(off at t | on at t - 1).
+        repair: P(on at t | off at t - 1).
+    """
+
+    failure: float
+    repair: float
+
+    @property
+    def missing_rate(self) -> float:
+        """Return the stationary probability of being off, failure / (failure + repair)."""
+        return self.failure / (self.failure + self.repair)
+
+
+def outage_rates(eta: float, mean_length: float) -> OutageRates:
+    r"""Return the Markov chain with a given share of time off and a given mean outage.
+
+    With $P(off \to on) = 1/L$ an outage lasts a geometric number of steps with mean L, and
+    $P(on \to off) = \frac{\eta}{1 - \eta} \frac{1}{L}$ makes eta the stationary probability of
+    being off (two-state Markov chain; as a channel model: Gilbert, "Capacity of a burst-noise
+    channel", Bell System Technical Journal 1960). L = 1 / (1 - eta) is the one mean length without
+    memory, which is MCAR at eta; a shorter one makes a sensor alternate.
+
+    Args:
+        eta: share of the steps that a sensor is off in the long run, in [0, 1).
+        mean_length: L, mean length of an outage in steps, at least 1.
+
+    Returns:
+        The transition probabilities.
+
+    Raises:
+        ValueError: if an argument is out of range, or `mean_length` is under eta / (1 - eta), where
+            P(on -> off) would exceed 1.
+
+    Example:
+        >>> rates = outage_rates(0.5, 20)
+        >>> rates.repair, rates.missing_rate
+        (0.05, 0.5)
+    """
+    if not 0.0 <= eta < 1.0:
+        raise ValueError(
+            f"`eta` must be a share of time in [0, 1), got {eta!r}. SensorReduction takes sensors "
+            "away for good."
+        )
+    if not 1.0 <= mean_length < math.inf:
+        raise ValueError(
+            f"`mean_length` must be the mean length of an outage in steps, at least 1, got "
+            f"{mean_length!r}."
+        )
+    odds = eta / (1.0 - eta)
+    failure = odds / mean_length
+    # 0.8 / (1 - 0.8) is 4.000000000000001 in floating point, and a mean length of 4 is meant
+    if failure > 1.0 + 1e-9:
+        raise ValueError(
+            f"`mean_length` must be at least eta / (1 - eta) = {odds:.4g} steps for eta {eta}, got "
+            f"{mean_length}: a sensor that is off so much of the time can't come back so soon."
+        )
+    return OutageRates(min(failure, 1.0), 1.0 / mean_length)
+
+
+def sample_working(
+    working: Tensor | None, rates: OutageRates, like: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Draw which sensors work at this step, given which worked at the step before.
+
+    Args:
+        working: bool, shape `(*batch, sensors)`, True where a sensor worked at the step before;
+            None draws from the stationary distribution.
+        rates: see `outage_rates`.
+        like: a tensor of shape `(*batch, sensors)` on the generator's device.
+        generator: source of randomness; every sensor takes one number a step.
+
+    Returns:
+        bool, shape `(*batch, sensors)`.
+
+    Example:
+        >>> rates, like = outage_rates(0.5, 1e6), torch.zeros(3, 4)
+        >>> before = sample_working(None, rates, like, torch.Generator().manual_seed(0))
+        >>> after = sample_working(before, rates, like, torch.Generator().manual_seed(1))
+        >>> bool((before == after).all())  # outages of a million steps
+        True
+    """
+    uniform = torch.rand(like.shape, generator=generator, device=like.device)
+    if working is None:
+        return uniform >= rates.missing_rate
+    return torch.where(working, uniform >= rates.failure, uniform < rates.repair)
+
+
+# ---------------------------------------------------------------------------------------- spikes
+def sample_spikes(
+    probability: Tensor | float, std: Tensor | float, like: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Draw gross errors: with a small probability, an error of standard deviation `std`.
+
+    Args:
+        probability: that a reading is hit; a number or shape `(obs,)`.
+        std: standard deviation of the error in observation units; a number or shape `(obs,)`.
+        like: a tensor of shape `(*batch, obs)` on the generator's device.
+        generator: source of randomness.
+
+    Returns:
+        The error, shape and dtype of `like`, 0 where there is none, and bool of the same shape,
+        True where a reading is hit. The same generator state hits the same readings whatever the
+        dtype of `like`.
+
+    Example:
+        >>> error, hit = sample_spikes(0.1, 50.0, torch.zeros(200, 9), torch.Generator())
+        >>> bool(((error != 0) == hit).all()), bool((hit.float().mean() - 0.1).abs() < 0.03)
+        (True, True)
+    """
+    hit = torch.rand(like.shape, generator=generator, device=like.device) < probability
+    return sample_noise(std, like, generator).masked_fill_(~hit, 0.0), hit

@@ -8,18 +8,22 @@ from torchrl_drbpn.transforms.missingness import (
 )
 from torchrl_drbpn.transforms.noise import ObservationNoise
 from torchrl_drbpn.transforms.normalisation import MaskedObservationNorm
+from torchrl_drbpn.transforms.outages import SensorOutages
 from torchrl_drbpn.transforms.previous_action import PreviousAction
 from torchrl_drbpn.transforms.return_scale import RunningReturnScale
 from torchrl_drbpn.transforms.seeding import seed_env
+from torchrl_drbpn.transforms.spikes import ObservationSpikes
 
 __all__ = [
     "FillLastObserved",
     "MaskedObservationNorm",
     "ObservationMissingness",
     "ObservationNoise",
+    "ObservationSpikes",
     "ObservedFromNaN",
     "PreviousAction",
     "RunningReturnScale",
+    "SensorOutages",
     "SensorReduction",
     "seed_env",
 ]

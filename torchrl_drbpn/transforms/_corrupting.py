@@ -198,7 +198,11 @@ class CorruptingTransform(OrderedTransform):
         self.complete_keys = complete
 
     def _corrupt(
-        self, observation: Tensor, observed: Tensor | None, root: TensorDictBase | None
+        self,
+        observation: Tensor,
+        observed: Tensor | None,
+        root: TensorDictBase | None,
+        following: TensorDictBase,
     ) -> tuple[Tensor, Tensor | None]:
         """Return the corrupted observation and its mask.
 
@@ -206,6 +210,8 @@ class CorruptingTransform(OrderedTransform):
             observation: shape `(*batch, obs)`, all in_keys side by side.
             observed: the mask so far, same shape, or None.
             root: the data of the step before, with the action; None at a reset.
+            following: the data of this step, observations not yet changed, where a subclass may
+                write what it has drawn.
         """
         raise NotImplementedError
 
@@ -224,7 +230,7 @@ class CorruptingTransform(OrderedTransform):
         observed = tensordict.get(mask_key, None)
         if observed is not None:
             self._check_mask(observed, observation, mask_key)
-        corrupted, observed = self._corrupt(observation, observed, root)
+        corrupted, observed = self._corrupt(observation, observed, root, tensordict)
         if self.complete_keys:
             tensordict.set(self.complete_keys[0], observation)
         tensordict.set(key, corrupted)
@@ -250,7 +256,7 @@ class CorruptingTransform(OrderedTransform):
                 -1,
             )
         sizes = [part.shape[-1] for part in parts]
-        corrupted, observed = self._corrupt(torch.cat(parts, -1), observed, root)
+        corrupted, observed = self._corrupt(torch.cat(parts, -1), observed, root, tensordict)
         for key, part in zip(self.complete_keys, parts, strict=bool(self.complete_keys)):
             tensordict.set(key, part)
         for key, part in zip(self.in_keys, torch.split(corrupted, sizes, -1), strict=True):

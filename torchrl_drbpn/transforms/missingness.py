@@ -130,8 +130,13 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
 
     # ------------------------------------------------------------------------------- on tensors
     def _corrupt(
-        self, observation: Tensor, observed: Tensor | None, root: TensorDictBase | None
+        self,
+        observation: Tensor,
+        observed: Tensor | None,
+        root: TensorDictBase | None,
+        following: TensorDictBase,
     ) -> tuple[Tensor, Tensor | None]:
+        del following
         probability: Tensor | float = self._eta
         if self.mechanism != "mcar":
             if observed is not None:
@@ -323,9 +328,13 @@ class SensorReduction(CorruptingTransform):
             )
 
     def _corrupt(
-        self, observation: Tensor, observed: Tensor | None, root: TensorDictBase | None
+        self,
+        observation: Tensor,
+        observed: Tensor | None,
+        root: TensorDictBase | None,
+        following: TensorDictBase,
     ) -> tuple[Tensor, Tensor | None]:
-        del root
+        del root, following
         present = self._present
         if (
             present is None
@@ -373,9 +382,13 @@ class ObservedFromNaN(CorruptingTransform):
         super().__init__(in_keys=in_keys, mask_keys=mask_keys)
 
     def _corrupt(
-        self, observation: Tensor, observed: Tensor | None, root: TensorDictBase | None
+        self,
+        observation: Tensor,
+        observed: Tensor | None,
+        root: TensorDictBase | None,
+        following: TensorDictBase,
     ) -> tuple[Tensor, Tensor | None]:
-        del root
+        del root, following
         arrived = observation == observation  # NaN alone differs from itself
         if observed is not None:
             arrived = arrived & observed

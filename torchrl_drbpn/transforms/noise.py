@@ -90,9 +90,13 @@ class ObservationNoise(SeededTransform, CorruptingTransform):
             )
 
     def _corrupt(
-        self, observation: Tensor, observed: Tensor | None, root: TensorDictBase | None
+        self,
+        observation: Tensor,
+        observed: Tensor | None,
+        root: TensorDictBase | None,
+        following: TensorDictBase,
     ) -> tuple[Tensor, Tensor | None]:
-        del root
+        del root, following
         std = self._cast_std
         if isinstance(std, Tensor) and (
             std.dtype is not observation.dtype or std.device != observation.device

@@ -1,0 +1,283 @@
+"""What `SensorOutages` promises: its contract, its law in an environment, groups, keys and errors.
+
+The transform goes through `contracts.TransformContract`. On top: masks follow the functional chain
+step by step, every episode from its own start; groups fail together, what is in none never does;
+the realised ratio is eta from the first step on, or rises to it; an existing mask is ANDed;
+workers, stored states and `seed_env` reproduce it; a lost state is named rather than drawn anew.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from contracts import ACTION, OBS, StaircaseEnv, TransformContract, gym_env, parallel_env
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import Binary
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
+
+from torchrl_drbpn.functional.corruption import outage_rates, sample_working
+from torchrl_drbpn.transforms import ObservationMissingness, SensorOutages, seed_env
+
+COMPLETE = "complete_observation"
+GROUPS = [[0, 3], [1, -1]]
+
+
+def staircase(*transforms, **kwargs):
+    return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
+
+
+def data(value=1.0, batch=(4,), **more):
+    return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
+
+
+# ------------------------------------------------------------------------------------ the contracts
+class OutageContract(TransformContract):
+    keeps_float64 = ("observation", COMPLETE)
+
+    def check_output(self, before, after):
+        observation, observed = after["observation"], after["observed"]
+        assert observed.dtype == after["sensor_on"].dtype == torch.bool
+        assert observed.shape == observation.shape
+        assert torch.equal(observation, after[COMPLETE].where(observed, 0.0))
+        if before.get("observation", None) is not None:
+            assert torch.equal(after[COMPLETE], before["observation"])
+
+
+class TestEverySensorByItself(OutageContract):
+    def make_transform(self):
+        return SensorOutages(0.5, 5, complete_key=COMPLETE)
+
+    def check_output(self, before, after):
+        super().check_output(before, after)
+        assert torch.equal(after["observed"], after["sensor_on"])
+
+
+class TestGroups(OutageContract):
+    def make_transform(self):
+        return SensorOutages(0.4, 3, groups=GROUPS, initial="on", complete_key=COMPLETE)
+
+    def check_output(self, before, after):
+        super().check_output(before, after)
+        on, observed = after["sensor_on"], after["observed"]
+        assert on.shape[-1] == 2
+        assert torch.equal(observed[..., [0, 3]], on[..., :1].expand(*on.shape[:-1], 2))
+        if observed.shape[-1] == OBS:
+            assert torch.equal(observed[..., [1, 4]], on[..., 1:].expand(*on.shape[:-1], 2))
+            assert observed[..., 2].all()
+
+    def make_env(self):
+        return gym_env("Reacher-v5")  # the groups name four different components
+
+
+# ------------------------------------------------------------------------------------------ the law
+def test_masks_follow_the_chain_and_every_episode_has_its_own_start():
+    transform = SensorOutages(0.5, 3)
+    env = staircase(transform)
+    generator = copy.copy(transform.generator(torch.device("cpu")))
+    rates, like = outage_rates(0.5, 3), torch.zeros(3, OBS)
+    rollout = env.rollout(9, break_when_any_done=False)
+    assert rollout["next", "done"].any(1).all()
+    expected = sample_working(None, rates, like, generator)
+    for t in range(9):
+        assert torch.equal(rollout["observed"][:, t], expected)
+        arrived = sample_working(expected, rates, like, generator)
+        assert torch.equal(rollout["next", "observed"][:, t], arrived)
+        over = rollout["next", "done"][:, t]
+        expected = arrived
+        if t < 8 and over.any():
+            expected = torch.where(over, sample_working(None, rates, like, generator), arrived)
+
+
+@pytest.mark.parametrize("groups", [None, [[0, 1], [2], [3, 4]]], ids=["sensor", "group"])
+def test_the_realised_ratio_is_eta_at_every_step_from_the_first(groups):
+    env = staircase(SensorOutages(0.3, 10, groups=groups), batch=4000, horizon=40)
+    on = env.rollout(20)["sensor_on"]
+    missing = 1 - on.double().mean((0, 2))
+    error = math.sqrt(0.3 * 0.7 / (4000 * on.shape[-1]))
+    assert missing.shape == (20,)
+    assert ((missing - 0.3).abs() < 4 * error).all()
+
+
+def test_from_sensors_that_all_work_the_ratio_rises_to_eta():
+    eta, length = 0.5, 8.0
+    rates = outage_rates(eta, length)
+    env = staircase(SensorOutages(eta, length, initial="on"), batch=4000, horizon=60)
+    missing = 1 - env.rollout(41)["observed"].double().mean((0, 2))
+    assert missing[0] == 0
+    steps = torch.arange(41, dtype=torch.float64)
+    law = eta * (1 - (1 - rates.failure - rates.repair) ** steps)
+    error = math.sqrt(0.25 / (4000 * OBS))
+    assert ((missing - law).abs() < 4.5 * error).all()
+    assert missing[-1] == pytest.approx(eta, abs=0.02)
+
+
+def test_groups_fail_together_and_what_is_in_none_always_arrives():
+    env = staircase(SensorOutages(0.5, 4, groups=GROUPS), batch=200, horizon=30)
+    observed = env.rollout(20)["observed"]
+    assert torch.equal(observed[..., 0], observed[..., 3])
+    assert torch.equal(observed[..., 1], observed[..., 4])
+    assert observed[..., 2].all()
+    both = torch.stack([observed[..., 0].flatten(), observed[..., 1].flatten()]).double()
+    # steps of one sensor are correlated over about four of them
+    assert torch.corrcoef(both)[0, 1].abs() < 4 / math.sqrt(both.shape[1] / 4)
+
+
+def test_eta_zero_changes_nothing():
+    clean = staircase().rollout(8, break_when_any_done=False)
+    rollout = staircase(SensorOutages(0.0, 5)).rollout(8, break_when_any_done=False)
+    assert rollout["next", "observed"].all()
+    assert torch.equal(rollout["next", "observation"], clean["next", "observation"])
+
+
+def test_one_seed_is_one_sequence_and_unrelated_to_that_of_other_classes():
+    def of(transform):
+        return staircase(transform, batch=500, horizon=20).rollout(8)["observed"]
+
+    assert torch.equal(of(SensorOutages(0.5, 2, seed=3)), of(SensorOutages(0.5, 2, seed=3)))
+    assert not torch.equal(of(SensorOutages(0.5, 2, seed=3)), of(SensorOutages(0.5, 2, seed=4)))
+    pair = [SensorOutages(0.5, 2, seed=3), ObservationMissingness("mcar", 0.5, seed=3)]
+    flat = torch.stack([of(transform).flatten().double() for transform in pair])
+    assert torch.corrcoef(flat)[0, 1].abs() < 4 / math.sqrt(flat.shape[1])
+
+
+# ----------------------------------------------------------------------------------- keys and masks
+def test_specs_say_what_is_written():
+    env = staircase(SensorOutages(0.5, 5, groups=GROUPS))
+    spec = env.observation_spec
+    assert isinstance(spec["sensor_on"], Binary)
+    assert spec["sensor_on"].shape == (3, 2)
+    assert env.state_spec["sensor_on"] == spec["sensor_on"]
+
+
+def test_a_mask_that_is_there_is_anded_and_the_chain_goes_on_beneath_it():
+    mask = torch.ones(4, OBS, dtype=torch.bool)
+    mask[:, 2] = False
+    before = data(1.0, observed=mask)
+    before["observation"][:, 2] = math.nan
+    after = SensorOutages(0.3, 5)._call(before)
+    assert torch.equal(after["observed"], after["sensor_on"] & mask)
+    assert torch.equal(after["observation"], after["observed"].float())
+    assert after["sensor_on"][:, 2].any()
+
+
+def test_writing_into_the_mask_does_not_repair_a_sensor():
+    after = SensorOutages(0.5, 5)._call(data(1.0, (50,)))
+    before = after["sensor_on"].clone()
+    after["observed"].fill_(True)
+    assert torch.equal(after["sensor_on"], before)
+
+
+def test_several_keys_are_one_vector_and_groups_reach_over_them():
+    both = TensorDict({"a": torch.ones(40, 2), "b": torch.ones(40, 3)}, [40])
+    outages = SensorOutages(
+        0.5, 5, groups=[[0, 2], [-1]], in_keys=["a", "b"], mask_keys=["ma", "mb"], state_key="on"
+    )
+    after = outages._call(both)
+    assert torch.equal(after["ma"][:, 0], after["on"][:, 0])
+    assert torch.equal(after["mb"][:, 0], after["on"][:, 0])
+    assert torch.equal(after["mb"][:, 2], after["on"][:, 1])
+    assert after["ma"][:, 1].all()
+    assert after["mb"][:, 1].all()
+
+
+def test_a_nested_observation_has_mask_and_state_beside_it():
+    inner = TensorDict({"observation": torch.ones(2, 3, OBS)}, [2, 3])
+    outer = TensorDict({"agents": inner}, [2])
+    after = SensorOutages(0.5, 5, in_keys=[("agents", "observation")])._call(outer)
+    assert after["agents", "sensor_on"].shape == (2, 3, OBS)
+    assert after.get("sensor_on", None) is None
+
+
+def test_two_of_them_need_two_states():
+    with pytest.raises(ValueError, match=r"`sensor_on` is among .* Pass state_key="):
+        _ = staircase(SensorOutages(0.2, 5), SensorOutages(0.2, 20, seed=1)).observation_spec
+    env = staircase(
+        SensorOutages(0.2, 5),
+        SensorOutages(0.2, 20, groups=[[0, 1, 2, 3, 4]], seed=1, state_key="bus_on"),
+        batch=500,
+        horizon=20,
+    )
+    rollout = env.rollout(10)
+    assert torch.equal(rollout["observed"], rollout["sensor_on"] & rollout["bus_on"])
+    # 1 - .8 * .8; a group is one draw for five entries
+    assert (1 - rollout["observed"].double().mean()) == pytest.approx(0.36, abs=0.05)
+
+
+def test_a_state_that_got_lost_is_named_rather_than_drawn_anew():
+    outages = SensorOutages(0.5, 5)
+    root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
+    with pytest.raises(KeyError, match=r"under 'sensor_on', which is not there\. Start from"):
+        outages._step(root, data())
+    root["sensor_on"] = torch.ones(4, 2, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"`sensor_on` must be bool of shape \(4, 5\)"):
+        outages._step(root, data())
+
+
+@pytest.mark.parametrize(
+    ("groups", "what"),
+    [
+        ([[0, 5]], "`groups` must hold indices from -5 to 4"),
+        ([[0, 1], [1]], "`groups` must name every component once at most"),
+        ([[4], [-1]], "`groups` must name every component once at most"),
+    ],
+)
+def test_groups_of_sensors_that_do_not_exist_or_twice_are_refused(groups, what):
+    with pytest.raises(ValueError, match=what):
+        _ = staircase(SensorOutages(0.5, 5, groups=groups)).observation_spec
+    with pytest.raises(ValueError, match=what):
+        SensorOutages(0.5, 5, groups=groups)._call(data())
+
+
+@pytest.mark.parametrize("groups", [[], [[]], [0, 1], [["a"]], [[True]], "legs"])
+def test_groups_are_lists_of_indices(groups):
+    with pytest.raises(ValueError, match="`groups` must "):
+        SensorOutages(0.5, 5, groups=groups)
+
+
+def test_bad_numbers_and_names_are_refused():
+    with pytest.raises(ValueError, match="`mean_length` must be at least eta"):
+        SensorOutages(0.9, 2)
+    with pytest.raises(ValueError, match=r"`initial` must be one of .* got 'off'"):
+        SensorOutages(0.5, 5, initial="off")
+    with pytest.raises(ValueError, match="`state_key` must be a key of its own"):
+        SensorOutages(0.5, 5, state_key="observed")
+
+
+# ------------------------------------------------------------------------------ collecting, workers
+def failing_gym():
+    return gym_env().append_transform(SensorOutages(0.5, 4))
+
+
+@pytest.mark.parametrize("kind", ["serial", "parallel"])
+def test_seed_env_reproduces_outages_and_gives_every_worker_its_own(kind):
+    env = SerialEnv(2, failing_gym) if kind == "serial" else parallel_env(2, failing_gym)
+
+    def masks(seed):
+        seed_env(env, seed)
+        policy = lambda td: td.set("action", torch.zeros(2, 1))  # noqa: E731
+        return env.rollout(8, policy, break_when_any_done=False)["observed"]
+
+    try:
+        first, again, other = masks(3), masks(3), masks(4)
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+        assert not torch.equal(first[0], first[1])
+    finally:
+        env.close(raise_if_closed=False)
+
+
+def test_a_collector_carries_outages_from_rollout_to_rollout():
+    env = staircase(SensorOutages(0.5, 1e6), batch=3, horizon=100)
+    collector = Collector(
+        env, frames_per_batch=12, total_frames=36, auto_register_policy_transforms=False
+    )
+    masks = [batch["observed"] for batch in collector]
+    collector.shutdown()
+    assert len(masks) == 3
+    # outages of a million steps: what worked at the start works to the end
+    for mask in masks:
+        assert torch.equal(mask, masks[0][:, :1].expand_as(mask))
