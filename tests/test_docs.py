@@ -186,6 +186,8 @@ def test_notation_names_the_keys_that_are_read_and_written():
     transforms = {  # required arguments, where there are some
         "ObservationMissingness": ("mcar", 0.5),
         "ObservationNoise": (0.1,),
+        "ObservationSpikes": (0.1, 5.0),
+        "SensorOutages": (0.5, 5),
         "SensorReduction": ([0],),
         "RunningReturnScale": (0.99,),
     }

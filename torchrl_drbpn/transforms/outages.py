@@ -109,12 +109,13 @@ class SensorOutages(SeededTransform, CorruptingTransform):
         if state_key is None:
             state_key = sibling_key(self.in_keys[0], "sensor_on")
         (self.state_key,) = as_key_list(state_key)
-        if self.state_key in self.out_keys:
+        written = [*self.in_keys, *self.mask_keys, *self.complete_keys]
+        if self.state_key in written:
             raise ValueError(
                 f"`state_key` must be a key of its own, got {self.state_key!r}, which this "
                 "transform writes something else to."
             )
-        self.out_keys = [*self.out_keys, self.state_key]
+        self.out_keys = [*written, self.state_key]
         self._columns: tuple[Tensor, Tensor] | None = None
 
     # ------------------------------------------------------------------------------- on tensors

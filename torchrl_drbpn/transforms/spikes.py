@@ -89,12 +89,12 @@ class ObservationSpikes(SeededTransform, CorruptingTransform):
             if spiked_key is None
             else pair_keys(self.in_keys, spiked_key, name="spiked_key", default="")
         )
-        if not set(self.spiked_keys).isdisjoint([*self.out_keys, *self.mask_keys]):
+        taken = [*self.in_keys, *self.mask_keys, *self.complete_keys]
+        if not set(self.spiked_keys).isdisjoint(taken):
             raise ValueError(
-                f"`spiked_key` must name keys of its own, got {self.spiked_keys} beside "
-                f"{[*self.out_keys, *self.mask_keys]}."
+                f"`spiked_key` must name keys of its own, got {self.spiked_keys} beside {taken}."
             )
-        self.out_keys = [*self.out_keys, *self.spiked_keys]
+        self.out_keys = [*self.in_keys, *self.complete_keys, *self.spiked_keys]
         self.probability = _per_component(
             probability, 1.0, "`probability` must be a number or one per component, in [0, 1]"
         )
@@ -136,7 +136,7 @@ class ObservationSpikes(SeededTransform, CorruptingTransform):
             spiked, hit = zero_missing(spiked, observed), hit & observed
         if self.spiked_keys:
             sizes = [following.get(key).shape[-1] for key in self.in_keys]
-            for key, part in zip(self.spiked_keys, hit.split(sizes, -1), strict=True):
+            for key, part in zip(self.spiked_keys, torch.split(hit, sizes, -1), strict=True):
                 following.set(key, part)
         return spiked, observed
 
