@@ -112,7 +112,7 @@ def test_by_default_nothing_complete_is_written():
 @pytest.mark.parametrize("belief", BELIEFS)
 def test_the_critic_reads_it_and_the_policy_does_not(belief):
     training, data = rollout(belief)
-    assert COMPLETE in training.loss.in_keys
+    assert COMPLETE in training.algorithm.loss.in_keys
     step = data[:, 5].select(*training.agent.policy.in_keys)
     assert COMPLETE not in step
     for part in (training.agent.policy, training.agent.actor, training.agent.belief):
@@ -138,7 +138,7 @@ def test_the_values_of_the_advantages_are_those_of_the_complete_observations(bel
     # and it reads the next complete observation where the episode ends or the rollout is cut
     changed = rollout(belief)[1]["next"].clone()
     changed[COMPLETE] += 1.0
-    moved = training.agent.next_value(changed)
+    moved = training.agent.one_step_value(changed)
     assert (moved != data["next", "state_value"]).all()
 
 
@@ -148,7 +148,7 @@ def test_every_belief_trains_with_it(belief):
     from assembly.training import train_rollout
 
     training, data = with_advantages(belief)
-    out = training.loss(to_sequences(data, training.loss, 16))
+    out = training.algorithm.loss(to_sequences(data, training.algorithm.loss, 16))
     assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
     first = training.agent.critic.module[0]
     (grad,) = torch.autograd.grad(out["loss_critic"], first.weight, retain_graph=True)

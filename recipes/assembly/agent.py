@@ -120,22 +120,22 @@ class Agent(nn.Module):
         return self.critic.module(*(tensordict.get(key) for key in self.critic.in_keys))
 
     @torch.no_grad()
-    def next_value(self, next_tensordict: TensorDictBase) -> torch.Tensor:
-        """Return V of the beliefs that follow, one step ahead of every stored step.
+    def one_step_value(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """Return V of the beliefs that one step of the belief module makes of what is stored.
 
-        The stored next step holds what arrived, the action before it and the belief before it, so
-        one batched step of the belief module gives every next belief at once: no second pass over
-        time, and truncated and terminal steps have theirs too.
+        A stored step holds what arrived, the action before it and the belief before it, so one
+        batched step gives every belief at once: no second pass over time. Of ``data["next"]`` it
+        gives the beliefs that follow, truncated and terminal steps included.
 
         Args:
-            next_tensordict: ``data["next"]``, any shape.
+            tensordict: a rollout or its ``"next"``, any shape.
 
         Returns:
             Values, shape ``(*, 1)``.
         """
         keys = (*self.belief.in_keys, *self.critic.in_keys)
-        single = next_tensordict.select(*keys, strict=False).reshape(-1)
-        return self.value(self.belief(single)).reshape(*next_tensordict.shape, 1)
+        single = tensordict.select(*keys, strict=False).reshape(-1)
+        return self.value(self.belief(single)).reshape(*tensordict.shape, 1)
 
 
 class _SideBySide(nn.Sequential):

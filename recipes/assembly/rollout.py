@@ -11,6 +11,40 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
 from assembly.agent import Agent
+from assembly.settings import LossSettings
+
+
+def make_gae(settings: LossSettings) -> GAE:
+    """Build TorchRL's estimator of advantages from values that are there already.
+
+    Args:
+        settings: discount and lambda.
+
+    Returns:
+        The estimator; it reads the scaled reward.
+    """
+    gae = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=None)
+    gae.set_keys(reward="scaled_reward")
+    return gae
+
+
+@torch.no_grad()
+def recompute_advantages(data: TensorDictBase, agent: Agent, gae: GAE) -> None:
+    """Write values and advantages by the current parameters into a rollout.
+
+    Every belief is taken one step on from the stored one before it, by the current parameters, in
+    one batched step: exact for a belief without memory. With memory, what lies before that step is
+    as old as the beliefs that the sequences of the update start from.
+
+    Args:
+        data: rollout of batch size ``(environments, time)``; changed in place.
+        agent: the agent as it is now.
+        gae: see :func:`make_gae`.
+    """
+    following = data.get("next")
+    data.set("state_value", agent.one_step_value(data))
+    following.set("state_value", agent.one_step_value(following))
+    gae(data)
 
 
 @torch.no_grad()
@@ -20,11 +54,11 @@ def add_advantages(data: TensorDictBase, agent: Agent, gae: GAE) -> None:
     Args:
         data: rollout of batch size ``(environments, time)`` with stored features; changed in place.
         agent: whose critic values the beliefs; its parameters are those that collected the rollout.
-        gae: TorchRL's estimator, built without a network.
+        gae: see :func:`make_gae`.
     """
     data.set("state_value", agent.value(data))
     following = data.get("next")
-    following.set("state_value", agent.next_value(following))
+    following.set("state_value", agent.one_step_value(following))
     gae(data)
 
 

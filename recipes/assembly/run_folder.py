@@ -35,6 +35,7 @@ _PACKAGES = (
 _LATER_SETTINGS: dict[str, Any] = {
     "algo": {"_target_": "assembly.algorithms.ppo.build", "name": "ppo"},
     "heads.critic_input": "features",
+    "optim.recompute_advantages": False,
 }
 
 

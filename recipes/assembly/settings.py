@@ -109,6 +109,7 @@ class OptimSettings:
     epochs: int
     minibatches: int
     sequence_length: int
+    recompute_advantages: bool
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from assembly.rollout import (
     add_advantages,
     explained_variance,
     log_likelihood_per_entry,
+    make_gae,
     realised_missing_ratio,
 )
 from assembly.settings import Settings
@@ -98,14 +99,12 @@ def assemble(settings: Settings) -> Training:
         use_buffers=False,
         auto_register_policy_transforms=False,
     )
-    gae = GAE(gamma=settings.loss.gamma, lmbda=settings.loss.lmbda, value_network=None)
-    gae.set_keys(reward="scaled_reward")
     return Training(
         belief=belief,
         agent=agent,
         env=env,
         collector=collector,
-        gae=gae,
+        gae=make_gae(settings.loss),
         algorithm=build_algorithm(settings, agent),
         progress=Progress(),
     )

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from assembly.agent import Agent
-from assembly.rollout import minibatches, to_sequences
-from assembly.settings import OptimSettings, Settings
+from assembly.rollout import make_gae, minibatches, recompute_advantages, to_sequences
+from assembly.settings import Settings
 
 _NAMES = {"kl_approx": "kl", "ESS": "ess"}
 
@@ -25,6 +25,7 @@ class PPO:
 
     Attributes:
         loss: its outputs named ``loss*`` are summed.
+        gae: estimator of advantages, where they are recomputed.
         optimizer: Adam over all parameters of the agent.
         generator: of the order of minibatches.
     """
@@ -32,6 +33,7 @@ class PPO:
     def __init__(self, agent: Agent, settings: Settings) -> None:
         self.agent, self.optim = agent, settings.optim
         self.loss = agent.make_loss(settings.loss)
+        self.gae = make_gae(settings.loss)
         self.optimizer = torch.optim.Adam(
             agent.parameters(), lr=settings.optim.lr, eps=settings.optim.eps, fused=True
         )
@@ -48,8 +50,22 @@ class PPO:
             The means of what the loss reports, and the learning rate.
         """
         lr = self.optim.lr * remaining
-        sequences = to_sequences(data, self.loss, self.optim.sequence_length)
-        return {**_update(self, sequences, self.optim, lr), "lr": lr}
+        return {**_update(self, data, lr), "lr": lr}
+
+    def sequences(self, data: TensorDictBase, epoch: int) -> TensorDict:
+        """Return what the minibatches of an epoch are cut from.
+
+        Args:
+            data: rollout of batch size ``(environments, time)`` with advantages; they are
+                changed in place where they are recomputed.
+            epoch: from 0.
+
+        Returns:
+            Sequences, batch size ``(environments * time / length, length)``.
+        """
+        if epoch and self.optim.recompute_advantages:
+            recompute_advantages(data, self.agent, self.gae)
+        return to_sequences(data, self.loss, self.optim.sequence_length)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the optimiser's state and the generator's.
@@ -72,14 +88,16 @@ class PPO:
         self.generator.set_state(state["minibatch_generator"])
 
 
-def _update(ppo: PPO, sequences: TensorDict, optim: OptimSettings, lr: float) -> dict[str, float]:
+def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
     """Take the gradient steps of one rollout; return the means of what the loss reports."""
-    optimizer, loss = ppo.optimizer, ppo.loss
+    optimizer, loss, optim = ppo.optimizer, ppo.loss, ppo.optim
     parameters = list(ppo.agent.parameters())
     for group in optimizer.param_groups:
         group["lr"] = lr
     seen: dict[str, list[torch.Tensor]] = {}
-    for _ in range(optim.epochs):
+    for epoch in range(optim.epochs):
+        if epoch == 0 or optim.recompute_advantages:
+            sequences = ppo.sequences(data, epoch)
         for minibatch in minibatches(sequences, optim.minibatches, ppo.generator):
             out = loss(minibatch)
             terms = {key: value for key, value in out.items() if isinstance(value, torch.Tensor)}

@@ -1,0 +1,85 @@
+"""optim.recompute_advantages: values and advantages by the current parameters, epoch by epoch.
+
+With the parameters that collected the rollout nothing changes; without memory the result is
+TorchRL's GAE with the network itself; the first epoch is that of the plain update; a run with it is
+as reproducible as one without.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from recipe_tools import BELIEFS, make_config
+
+SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.5")
+
+
+def assemble(*overrides: str):
+    from assembly.settings import read_settings
+    from assembly.training import assemble as assembled
+
+    settings = read_settings(make_config(*SMOKE, *overrides))
+    return assembled(settings), settings
+
+
+def collected(*overrides: str):
+    from assembly.rollout import add_advantages
+
+    with torch.random.fork_rng():
+        training, _ = assemble(*overrides)
+        training.collector.rollout()
+        data = training.collector.rollout().clone()
+    add_advantages(data, training.agent, training.gae)
+    return training, data
+
+
+def move_critic(training) -> None:
+    with torch.no_grad():
+        for parameter in training.agent.critic.parameters():
+            parameter.add_(0.1)
+
+
+# A particle filter draws anew at every pass: its beliefs are not repeated by a second step.
+@pytest.mark.parametrize("belief", [b for b in BELIEFS if b != "dvrl"])
+def test_the_parameters_that_collected_give_the_advantages_that_were_there(belief):
+    from assembly.rollout import recompute_advantages
+
+    training, data = collected(f"belief={belief}")
+    before = data["advantage"].clone()
+    with torch.random.fork_rng():
+        recompute_advantages(data, training.agent, training.gae)
+    torch.testing.assert_close(data["advantage"], before, rtol=1e-4, atol=1e-4)
+
+
+def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
+    from assembly.rollout import recompute_advantages
+    from torchrl.objectives.value import GAE
+
+    training, data = collected("belief=none")
+    stale = data["advantage"].clone()
+    move_critic(training)
+    recompute_advantages(data, training.agent, training.gae)
+    gae = GAE(gamma=0.99, lmbda=0.95, value_network=training.agent.critic, shifted=False)
+    gae.set_keys(reward="scaled_reward")
+    expected = data.clone()
+    for part in (expected, expected["next"]):
+        training.agent.belief(part)
+    gae(expected)
+    torch.testing.assert_close(data["advantage"], expected["advantage"], rtol=1e-5, atol=1e-5)
+    assert not torch.allclose(data["advantage"], stale, atol=1e-3)
+
+
+def losses(recompute: bool, epochs: int) -> dict[str, float]:
+    from assembly.training import train_rollout
+
+    with torch.random.fork_rng():
+        flag = f"optim.recompute_advantages={str(recompute).lower()}"
+        training, settings = assemble(flag, f"optim.epochs={epochs}", "optim.lr=0.01")
+        row, _ = train_rollout(training, settings)
+    return {key: row[key] for key in ("loss_critic", "loss_objective", "grad_norm")}
+
+
+def test_the_first_epoch_is_that_of_the_plain_update_and_later_ones_differ():
+    assert losses(True, 1) == losses(False, 1)
+    assert losses(True, 3) == losses(True, 3)
+    assert losses(True, 3) != losses(False, 3)
