@@ -1,8 +1,12 @@
-"""Report finished runs: ``python recipes/report.py 'run=runs/*' out=results/<study>``.
+"""Report finished runs: ``python recipes/report.py 'run=runs/robust/*' out=results/robust``.
 
-Writes training.csv, evaluation.csv, summary.csv, figures, and README.md with the tables, the
-commands and the versions behind them. No seed is left out. The same run folders give the same
-bytes in every table and page.
+Writes CSV files, figures, and README.md with the tables, the commands and the versions behind them.
+No seed is left out. ``notes.md`` in that folder, written by hand, is put below the heading.
+
+``python recipes/report.py out=results/robust`` makes the same again, byte for byte, from the run
+folders in ``results/robust/runs`` and the options of the last report, kept in report.yaml.
+``python recipes/report.py index=results`` does so for every study there and writes
+``results/README.md``.
 """
 
 from __future__ import annotations
@@ -19,25 +23,34 @@ from assembly.belief_figure import save_figure
 from assembly.console import run_or_explain, say
 from assembly.errors import UserError
 from assembly.report_figures import learning_curves, robustness
-from assembly.report_page import csv_cells, study_page
+from assembly.report_index import index_page, studies_of
+from assembly.report_options import OPTIONS_FILE, Options, read_options
+from assembly.report_page import Tables, csv_cells, study_page
+from assembly.report_paper import aggregate_rows, efficiency_rows, margin_rows
 from assembly.report_runs import find_folders, read_study
 from assembly.report_tables import evaluation_rows, summary_rows, training_rows
 from assembly.run_folder import write_table, write_whole
 from omegaconf import DictConfig, OmegaConf
 
+NOTES_FILE = "notes.md"
 # In this order: the page, which names the others, comes last.
 _FILES = (
+    OPTIONS_FILE,
     "training.csv",
     "evaluation.csv",
     "summary.csv",
+    "aggregate.csv",
+    "margins.csv",
+    "efficiency.csv",
     "learning_curves.png",
     "robustness.png",
+    "robustness_mean_actions.png",
     "README.md",
 )
 
 
 def run(config: dict[str, Any]) -> int:
-    """Read the runs and write the study.
+    """Read the runs and write the study, or every study of an index.
 
     Args:
         config: see conf/report.yaml.
@@ -45,39 +58,75 @@ def run(config: dict[str, Any]) -> int:
     Returns:
         The exit status.
     """
-    if config["run"] is None or config["out"] is None:
-        raise UserError("`run` and `out` must be given: 'run=runs/*' out=results/<study>.")
-    if config["rows"] < 2:
-        raise UserError(f"`rows` must be 2 or more, got {config['rows']}.")
+    if config["index"] is not None:
+        if config["run"] is not None or config["out"] is not None:
+            raise UserError("`index` makes every study again: leave out `run` and `out`.")
+        return _write_index(Path(config["index"]))
+    if config["out"] is None:
+        raise UserError(
+            "`out` must be given: 'run=runs/*' out=results/<study>, or out=results/<study> alone "
+            "to make it again from results/<study>/runs."
+        )
     out = Path(config["out"])
     if out.exists() and not out.is_dir():
         raise UserError(f"`out` must be a folder, {out} is a file.")
-    runs = read_study(find_folders(config["run"]), unfinished=config["unfinished"])
+    wanted = config["run"] if config["run"] is not None else str(out / "runs" / "*")
+    _write_study(wanted, out, read_options(config, out))
+    return 0
+
+
+def _write_index(folder: Path) -> int:
+    studies = studies_of(folder)
+    for study in studies:
+        _write_study(str(study / "runs" / "*"), study, read_options({}, study))
+    write_whole(folder / "README.md", index_page(folder, studies))
+    say(f"{len(studies)} studies, written: {folder / 'README.md'}")
+    return 0
+
+
+def _write_study(wanted: Any, out: Path, options: Options) -> None:
+    runs = read_study(find_folders(wanted), unfinished=options.unfinished)
     out.parent.mkdir(parents=True, exist_ok=True)
     # Everything is made beside the study first: an error leaves the old one as it was.
     work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
         summary = summary_rows(runs)
-        write_table(
-            work / "training.csv",
-            csv_cells([row for r in runs for row in training_rows(r, config["rows"])]),
+        tables = Tables(
+            summary,
+            aggregate_rows(runs, summary),
+            margin_rows(runs, summary),
+            efficiency_rows(runs),
         )
-        evaluations = csv_cells([row for r in runs for row in evaluation_rows(r)])
-        if evaluations:
-            write_table(work / "evaluation.csv", evaluations)
-        write_table(work / "summary.csv", csv_cells(summary))
+        for name, rows in {
+            "training.csv": [row for r in runs for row in training_rows(r, options.rows)],
+            "evaluation.csv": [row for r in runs for row in evaluation_rows(r)],
+            "summary.csv": tables.summary,
+            "aggregate.csv": tables.aggregate,
+            "margins.csv": tables.margins,
+            "efficiency.csv": tables.efficiency,
+        }.items():
+            if rows:
+                write_table(work / name, csv_cells(rows))
         figures = {
-            "learning_curves.png": learning_curves(runs, config["rows"]),
-            "robustness.png": robustness(runs),
+            "learning_curves.png": learning_curves(runs, options.rows),
+            "robustness.png": robustness(runs, "sampled"),
+            "robustness_mean_actions.png": robustness(runs, "mean"),
         }
         drawn = {name: figure for name, figure in figures.items() if figure is not None}
         for name, figure in drawn.items():
             save_figure(figure, work / name, dpi=110)
-        title = config["title"] or out.resolve().name
+        name = out.resolve().name
         page = study_page(
-            runs, summary, list(drawn), title=title, out=out.resolve(), options=_options(config)
+            runs,
+            tables,
+            list(drawn),
+            title=options.title or name,
+            notes=_notes(out),
+            name=name,
+            options=options.words(),
         )
         write_whole(work / "README.md", page)
+        write_whole(work / OPTIONS_FILE, options.text())
         out.mkdir(exist_ok=True)
         for name in _FILES:
             if (work / name).is_file():
@@ -87,18 +136,11 @@ def run(config: dict[str, Any]) -> int:
     finally:
         shutil.rmtree(work, ignore_errors=True)
     say(f"{len(runs)} runs, written: {out}")
-    return 0
 
 
-def _options(config: dict[str, Any]) -> list[str]:
-    """Return what else the study depends on, as arguments; a title in Hydra's quotes."""
-    options = [f"rows={config['rows']}"]
-    if config["title"] is not None:
-        quoted = str(config["title"]).replace("\\", "\\\\").replace('"', '\\"')
-        options.append(f'title="{quoted}"')
-    if config["unfinished"]:
-        options.append("unfinished=true")
-    return options
+def _notes(out: Path) -> str:
+    path = out / NOTES_FILE
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="report")

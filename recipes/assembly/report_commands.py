@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from hydra.errors import HydraException
@@ -73,7 +72,8 @@ def evaluation_command(run: StudyRun) -> str | None:
         run: the run.
 
     Returns:
-        ``python recipes/evaluate.py`` with points, modes and episodes; None where it was not run.
+        ``python recipes/evaluate.py`` with points, modes and episodes, of all cells where the run
+        is a cell of a study; None where it was not run.
     """
     rows = [row for row in run.evaluations if row["source"] == "points"]
     if not rows:
@@ -82,27 +82,49 @@ def evaluation_command(run: StudyRun) -> str | None:
     present = {row["mode"] for row in rows}
     modes = [mode for mode in ("sampled", "mean") if mode in present]
     episodes = max(int(row["episodes"]) for row in rows)
-    words = [f"run=runs/{run.name}", f"points=[{','.join(points)}]", f"episodes={episodes}"]
+    folder = f"runs/{run.study}/*" if run.study else f"runs/{run.name}"
+    words = [f"run={folder}", f"points=[{','.join(points)}]", f"episodes={episodes}"]
     if len(modes) < 2:
         words.append(f"modes=[{','.join(modes)}]")
     return " ".join(["python recipes/evaluate.py", *(shlex.quote(word) for word in words)])
 
 
-def report_command(runs: Sequence[StudyRun], out: Path, options: Sequence[str] = ()) -> str:
-    """Return the command that makes the report, from the repository's root.
+def commands_from_nothing(
+    runs: Sequence[StudyRun], name: str, options: Sequence[str] = ()
+) -> list[str]:
+    """Return the commands that train, evaluate and report, from the repository's root.
 
     Args:
         runs: of the study.
-        out: its folder.
-        options: further arguments.
+        name: of the folder of the report.
+        options: further arguments of ``recipes/report.py``.
 
     Returns:
-        The command; runs are looked for in ``runs/``, as where the other commands put them.
+        Commands. Cells of a study are trained by the study's own.
     """
-    names = sorted(run.name for run in runs)
-    listed = ",".join(f"runs/{name}" for name in names)
-    words = [f"run=[{listed}]", f"out=results/{out.name}", *options]
-    return " ".join(["python recipes/report.py", *(shlex.quote(word) for word in words)])
+    alone = [run for run in runs if run.study is None]
+    studies = list(dict.fromkeys(run.study for run in runs if run.study is not None))
+    commands = [f"python recipes/study.py study={study}" for study in studies]
+    commands += [training_command(run) for run in alone]
+    evaluations = [evaluation_command(run) for run in runs]
+    commands += list(dict.fromkeys(command for command in evaluations if command is not None))
+    folders = [f"runs/{study}/*" for study in studies]
+    folders += sorted(f"runs/{run.name}" for run in alone)
+    listed = folders[0] if len(folders) == 1 else f"[{','.join(folders)}]"
+    words = [f"run={listed}", f"out=results/{name}", *options]
+    return [*commands, " ".join(["python recipes/report.py", *(shlex.quote(w) for w in words)])]
+
+
+def rebuild_command(name: str) -> str:
+    """Return the command that makes the tables again from the run folders beside them.
+
+    Args:
+        name: of the folder of the report.
+
+    Returns:
+        The command.
+    """
+    return f"python recipes/report.py out=results/{name}"
 
 
 def _value(value: Any) -> str:

@@ -10,12 +10,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from assembly.belief_figure import STYLE
-from assembly.report_runs import StudyRun, grouped, point_order
+from assembly.report_runs import StudyRun, grouped, point_kind, point_order
+from assembly.report_statistics import Array, interquartile_mean, interval
 from assembly.report_tables import final_evaluation, training_rows
 
 _COLOURS = ("#1f6fb4", "#d1622b", "#3a923a", "#8d5aa8", "#7f6a4f", "#c44e7f", "#5f6b73")
-_PANEL = (4.3, 3.3)  # inches
+_PANEL = (4.3, 3.1)  # inches
 _COLUMNS = 3
+_GRID = 200  # points of a curve
+_NOTHING = "none"
+
+_Group = Sequence[StudyRun]
 
 
 def learning_curves(runs: Sequence[StudyRun], rows: int) -> Figure:
@@ -26,88 +31,116 @@ def learning_curves(runs: Sequence[StudyRun], rows: int) -> Figure:
         rows: points of a curve.
 
     Returns:
-        The figure: each seed thin, their mean thick, evaluations with sampled and mean actions
-        as markers.
+        The figure: interquartile mean over seeds and its 95 % interval for each method. Where a
+        panel holds one method only, also every seed, and the evaluations as markers.
     """
     with mpl.rc_context(STYLE):
-        figure, panels = _panels(runs)
-        for task, axis in panels.items():
+        tasks = list(dict.fromkeys(run.group["task"] for run in runs))
+        lines = -(-len(tasks) // _COLUMNS)
+        figure, axes = _panels(lines, min(len(tasks), _COLUMNS))
+        colours = _colours(runs)
+        for axis, task in zip(axes.ravel(), tasks, strict=False):
             groups = [g for g in grouped(runs) if g[0].group["task"] == task]
-            for colour, members in zip(_cycle(len(groups)), groups, strict=True):
-                _draw_curves(axis, members, rows, colour, _label(members, groups))
+            for members in groups:
+                label = _label(members, runs)
+                _draw_curves(axis, members, rows, colours[label], label, alone=len(groups) == 1)
             missing = np.mean([run.missing_ratio for group in groups for run in group])
             axis.set_title(f"{task}: {100 * missing:.0f} % of the entries missing")
             axis.set_xlabel("environment steps, millions")
-            axis.legend(frameon=False, fontsize=8.5)
-        _first(panels).set_ylabel("raw return")
+        for axis in axes.ravel()[len(tasks) :]:
+            axis.axis("off")
+        for axis in axes[:, 0]:
+            axis.set_ylabel("raw return, training")
+        _legend(figure, axes)
     return figure
 
 
-def robustness(runs: Sequence[StudyRun]) -> Figure | None:
+def robustness(runs: Sequence[StudyRun], mode: str = "sampled") -> Figure | None:
     """Draw the return of the last checkpoints over the realised missing ratio.
 
     Args:
         runs: of a study.
+        mode: kind of action.
 
     Returns:
-        The figure, sampled actions; None where no task was evaluated at two points.
+        The figure, a column a task and a row a kind of missingness: interquartile mean over seeds
+        and its 95 % interval for each method. None where no task was evaluated at two points.
     """
     with mpl.rc_context(STYLE):
-        series = [s for members in grouped(runs) for s in _series(members)]
+        series = {
+            (members[0].group["task"], kind, _label(members, runs)): (members, points)
+            for members in grouped(runs)
+            for kind, points in _series(members, mode)
+        }
         if not series:
             return None
-        tasks = {members[0].group["task"] for members, _, _ in series}
-        figure, panels = _panels([run for run in runs if run.group["task"] in tasks])
-        for task, axis in panels.items():
-            own = [s for s in series if s[0][0].group["task"] == task]
-            groups = [g for g in grouped(runs) if g[0].group["task"] == task]
-            for colour, (members, mechanism, points) in zip(_cycle(len(own)), own, strict=True):
-                label = f"{_label(members, groups)}, evaluated on {mechanism}"
-                _draw_points(axis, members, points, colour, label)
-            axis.set_title(task)
-            axis.set_xlabel("realised missing ratio")
-            axis.set_xlim(left=-0.02)
-            low, high = (min(0.0, axis.dataLim.ymin), max(0.0, axis.dataLim.ymax))
-            room = 0.16 * (high - low or 1.0)
-            axis.set_ylim(low - (room if low < 0 else 0), high + room)
-            axis.legend(frameon=False, fontsize=8.5, loc="lower left")
-        _first(panels).set_ylabel("raw return, sampled actions")
+        tasks = list(dict.fromkeys(task for task, _, _ in series))
+        kinds = sorted({kind for _, kind, _ in series})
+        figure, axes = _panels(len(kinds), len(tasks))
+        colours = _colours(runs)
+        for line, kind in enumerate(kinds):
+            for column, task in enumerate(tasks):
+                axis = axes[line, column]
+                own = {k[2]: s for k, s in series.items() if k[:2] == (task, kind)}
+                if not own:
+                    axis.axis("off")
+                    continue
+                nominal = True
+                for label, (members, points) in own.items():
+                    _draw_points(axis, members, points, mode, colours[label], label, nominal)
+                    nominal = False  # once a panel is enough
+                axis.set_title(f"{task}, {kind}")
+                axis.set_xlim(left=-0.02)
+                axis.set_xlabel("realised missing ratio")
+                low, high = min(0.0, axis.dataLim.ymin), max(0.0, axis.dataLim.ymax)
+                room = 0.12 * (high - low or 1.0)
+                axis.set_ylim(low - (room if low < 0 else 0), high + room)
+        for axis in axes[:, 0]:
+            axis.set_ylabel(f"raw return, {mode} actions")
+        _legend(figure, axes)
     return figure
 
 
-def _panels(runs: Sequence[StudyRun]) -> tuple[Figure, dict[str, Any]]:
-    tasks = list(dict.fromkeys(run.group["task"] for run in runs))
-    columns = min(len(tasks), _COLUMNS)
-    lines = -(-len(tasks) // columns)
-    figure = Figure(figsize=(_PANEL[0] * columns, _PANEL[1] * lines), layout="constrained")
-    axes = figure.subplots(lines, columns, squeeze=False).ravel()
-    for axis in axes[len(tasks) :]:
-        axis.axis("off")
-    return figure, dict(zip(tasks, axes, strict=False))
+def _panels(lines: int, columns: int) -> tuple[Figure, Any]:
+    size = (max(_PANEL[0] * columns, 5.0), _PANEL[1] * lines + 0.4)
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(lines, columns, squeeze=False)
 
 
-def _first(panels: dict[str, Any]) -> Any:
-    return next(iter(panels.values()))
+def _legend(figure: Figure, axes: Any) -> None:
+    """Put one legend below all panels, each label once."""
+    found: dict[str, Any] = {}
+    for axis in axes.ravel():
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    figure.legend(
+        list(found.values()),
+        list(found),
+        loc="outside lower center",
+        ncol=min(len(found), 6 if axes.shape[1] > 1 else 3),
+        frameon=False,
+    )
 
 
-def _cycle(count: int) -> list[str]:
-    return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
+def _colours(runs: Sequence[StudyRun]) -> dict[str, str]:
+    """Return a colour a label, the same in every panel and figure of a study."""
+    labels = dict.fromkeys(_label(members, runs) for members in grouped(runs))
+    return {label: _COLOURS[i % len(_COLOURS)] for i, label in enumerate(labels)}
 
 
-def _label(members: Sequence[StudyRun], groups: Sequence[Sequence[StudyRun]]) -> str:
-    """Name what tells a group from the others of its panel."""
+def _label(members: _Group, runs: Sequence[StudyRun]) -> str:
+    """Name what tells a group from the others of the study, its task left out."""
     group = members[0].group
-    others = [g[0].group for g in groups]
-    parts = [group["belief"]]
-    if len({g["trained_on"] for g in others}) > 1:
+    parts = [group["method"]]
+    if len({run.group["trained_on"] for run in runs}) > 1:
         parts.append(group["trained_on"])
-    if len({g["noise_sigma"] for g in others}) > 1:
+    if len({run.group["noise_sigma"] for run in runs}) > 1:
         parts.append(f"sigma {group['noise_sigma']:g}")
     return ", ".join(parts)
 
 
 def _draw_curves(
-    axis: Any, members: Sequence[StudyRun], rows: int, colour: str, label: str
+    axis: Any, members: _Group, rows: int, colour: str, label: str, *, alone: bool
 ) -> None:
     curves = []
     for run in members:
@@ -116,15 +149,16 @@ def _draw_curves(
             curves.append(
                 (np.array([r["frames"] for r in known]), np.array([r["return"] for r in known]))
             )
+    if not curves:
+        return
+    # Where every seed has a value: a mean over fewer would jump.
+    low, high = max(c[0][0] for c in curves), min(c[0][-1] for c in curves)
+    grid = np.linspace(low, high, _GRID)
+    _draw_band(axis, grid / 1e6, [np.interp(grid, *curve) for curve in curves], colour, label)
+    if not alone:
+        return
     for frames, returns in curves:
         axis.plot(frames / 1e6, returns, color=colour, lw=0.8, alpha=0.5)
-    if curves:
-        # Where every seed has a value: a mean over fewer would jump.
-        low, high = max(c[0][0] for c in curves), min(c[0][-1] for c in curves)
-        grid = np.linspace(low, high, 200)
-        mean = np.mean([np.interp(grid, *curve) for curve in curves], axis=0)
-        seeds = f"{len(curves)} seed{'s' if len(curves) > 1 else ''}"
-        axis.plot(grid / 1e6, mean, color=colour, lw=2.2, label=f"{label}, training, {seeds}")
     for mode, marker, face in (("sampled", "o", colour), ("mean", "D", "white")):
         points: dict[float, list[float]] = {}
         for run in members:
@@ -139,53 +173,70 @@ def _draw_curves(
             color=colour,
             mfc=face,
             ms=5,
-            label=f"evaluation, {mode} actions",
+            label=f"{label}, evaluation, {mode} actions",
         )
 
 
-_Series = tuple[Sequence[StudyRun], str, list[str]]
+def _draw_band(
+    axis: Any, x: Array, values: Sequence[Array], colour: str, label: str, style: str = "-"
+) -> Array:
+    """Draw the interquartile mean over seeds and its 95 % interval; return the mean."""
+    mean = interquartile_mean(np.stack(values, axis=-1))
+    seeds = f"{len(values)} seed{'s' if len(values) > 1 else ''}"
+    axis.plot(x, mean, style, color=colour, lw=2.0, ms=4.5, label=f"{label}, {seeds}")
+    ends = interval([np.stack(values)])
+    if ends is not None:
+        axis.fill_between(x, *ends, color=colour, alpha=0.15, lw=0)
+    return mean
 
 
-def _series(members: Sequence[StudyRun]) -> list[_Series]:
-    """Return the points of each mechanism, nothing missing first, where there are two or more."""
+def _series(members: _Group, mode: str) -> list[tuple[str, list[str]]]:
+    """Return the points of each kind of missingness that all seeds have, two or more.
+
+    The point with nothing missing belongs to every kind, as its first.
+    """
     points = {
         row["point"]
         for run in members
         for row in run.evaluations
-        if row["source"] != "training" and final_evaluation(run, row["point"], "sampled")
+        if row["source"] != "training" and final_evaluation(run, row["point"], mode)
     }
-    whole = [p for p in points if all(final_evaluation(run, p, "sampled") for run in members)]
-    clean = [p for p in whole if p.startswith("none")]
-    mechanisms = sorted({p.partition(":")[0] for p in whole} - {"none"})
+    whole = [p for p in points if all(final_evaluation(run, p, mode) for run in members)]
+    clean = [p for p in whole if p.startswith(_NOTHING)]
     out = []
-    for mechanism in mechanisms:
-        own = [p for p in whole if p.partition(":")[0] == mechanism]
+    for kind in sorted({point_kind(p) for p in whole} - {_NOTHING}):
+        own = [p for p in whole if point_kind(p) == kind]
         ordered = sorted([*clean, *own], key=point_order)
         if len(ordered) > 1:
-            out.append((members, mechanism.upper(), ordered))
+            out.append((kind, ordered))
     return out
 
 
 def _draw_points(
-    axis: Any, members: Sequence[StudyRun], points: Sequence[str], colour: str, label: str
+    axis: Any,
+    members: _Group,
+    points: Sequence[str],
+    mode: str,
+    colour: str,
+    label: str,
+    nominal: bool,
 ) -> None:
-    table = []
-    for run in members:
-        found = [final_evaluation(run, point, "sampled") for point in points]
-        table.append([(row["missing_ratio"], row["return_mean"]) for row in found if row])
-    values = np.array(table)  # seeds, points, (missing ratio, return)
-    for line in values:
-        axis.plot(line[:, 0], line[:, 1], color=colour, lw=0.8, alpha=0.5)
-    mean = values.mean(0)
-    axis.plot(mean[:, 0], mean[:, 1], "o-", color=colour, lw=2.2, ms=5, label=label)
-    for point, (x, y) in zip(points, mean, strict=True):
-        if not point.startswith("none"):
+    found = [[final_evaluation(run, point, mode) for point in points] for run in members]
+    # shape: (seeds, points)
+    ratios = np.array([[row["missing_ratio"] for row in line if row] for line in found])
+    returns = [np.array([row["return_mean"] for row in line if row]) for line in found]
+    x = ratios.mean(0)
+    mean = _draw_band(axis, x, returns, colour, label, style="o-")
+    if not nominal:
+        return
+    for point, at, height in zip(points, x, mean, strict=True):
+        if not point.startswith(_NOTHING):
             axis.annotate(
-                f"nominal {point.partition(':')[2]}",
-                (x, y),
+                f"{point_order(point)[1]:g}",
+                (at, height),
                 textcoords="offset points",
-                xytext=(0, 8),
+                xytext=(0, 7),
                 ha="center",
-                fontsize=8,
-                color=colour,
+                fontsize=7.5,
+                color="#666666",
             )

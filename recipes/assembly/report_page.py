@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-from assembly.report_commands import evaluation_command, report_command, training_command
-from assembly.report_runs import StudyRun, grouped
+import numpy as np
+
+from assembly.report_commands import commands_from_nothing, rebuild_command
+from assembly.report_paper import THRESHOLDS, task_family
+from assembly.report_runs import Row, StudyRun, grouped
+from assembly.report_statistics import interquartile_mean
 from assembly.report_tables import KEPT, format_number
 
 _TRAINING_COLUMNS = (
@@ -16,152 +20,276 @@ _TRAINING_COLUMNS = (
     ("log-likelihood", "training log-likelihood"),
     ("steps/s", "training steps/s"),
 )
+_MODES = {"sampled": "sampled actions", "mean": "mean actions"}
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What a page shows; each is a CSV file of the study too.
+
+    Attributes:
+        summary: rows of :func:`assembly.report_tables.summary_rows`.
+        aggregate: rows of :func:`assembly.report_paper.aggregate_rows`.
+        margins: rows of :func:`assembly.report_paper.margin_rows`.
+        efficiency: rows of :func:`assembly.report_paper.efficiency_rows`.
+    """
+
+    summary: Sequence[Row]
+    aggregate: Sequence[Row]
+    margins: Sequence[Row]
+    efficiency: Sequence[Row]
 
 
 def study_page(
-    runs: Sequence[StudyRun], summary: Sequence[Mapping[str, Any]], figures: Sequence[str], *,
-    title: str, out: Path, options: Sequence[str] = (),
+    runs: Sequence[StudyRun], tables: Tables, figures: Sequence[str], *, title: str, notes: str,
+    name: str, options: Sequence[str] = (),
 ) -> str:  # fmt: skip
     """Write the page.
 
     Args:
         runs: of the study.
-        summary: rows of :func:`assembly.report_tables.summary_rows`.
+        tables: what came out.
         figures: names of the PNG files beside the page.
         title: its heading.
-        out: folder of the study.
+        notes: what a person says about it, Markdown; put below the heading as it is.
+        name: of the folder of the study.
         options: further arguments of the command that made the page.
 
     Returns:
         Markdown.
     """
-    parts = [f"# {title}", _what(runs)]
-    parts += [f"![{_FIGURE_TEXTS[name]}]({name})" for name in figures]
-    parts += ["## Training", _TRAINING_TEXT, _training_table(runs, summary)]
-    evaluated = _evaluation_table(summary)
+    parts = [f"# {title}", notes.strip(), _unfinished(runs)]
+    parts += [f"![{FIGURE_TEXTS[figure]}]({figure})" for figure in figures]
+    parts += ["## Training", _TRAINING_TEXT, _training_table(runs, tables.summary)]
+    evaluated = _evaluation_tables(tables.summary)
     if evaluated:
-        parts += ["## Evaluation of the last checkpoint", _EVALUATION_TEXT, evaluated]
-    parts += ["## Commands", "```bash\n" + "\n".join(_commands(runs, out, options)) + "\n```"]
-    parts += ["## Made with", _versions(runs)]
+        parts += ["## Evaluation of the last checkpoint", _EVALUATION_TEXT, *evaluated]
+    if tables.aggregate:
+        parts += ["## Over all tasks", _AGGREGATE_TEXT, _aggregate_table(tables.aggregate)]
+    if tables.margins:
+        parts += ["## Margins of drbpn", _MARGIN_TEXT, _margin_table(tables.margins)]
+    if tables.efficiency:
+        parts += ["## Sample efficiency", _EFFICIENCY_TEXT, _efficiency_table(tables.efficiency)]
+    commands = "\n".join(commands_from_nothing(runs, name, options))
+    parts += ["## Commands", f"From nothing to this page:\n\n```bash\n{commands}\n```"]
     parts += [
-        "Every number behind the tables: `training.csv` (thinned learning curves), "
-        "`evaluation.csv` (every evaluation of every run), `summary.csv`."
+        "Tables and page again, byte for byte, from the run folders that lie beside it:\n\n"
+        f"```bash\n{rebuild_command(name)}\n```"
     ]
-    return "\n\n".join(parts) + "\n"
+    parts += ["## Made with", _versions(runs)]
+    parts += ["Every number behind the tables stands in the CSV files beside this page."]
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
-_FIGURE_TEXTS = {
-    "learning_curves.png": "Training return over environment steps, one thin line a seed, the "
-    "thick line their mean",
-    "robustness.png": "Return of the last checkpoint over the realised missing ratio, one thin "
-    "line a seed, the thick line their mean",
+FIGURE_TEXTS = {
+    "learning_curves.png": "Training return over environment steps: interquartile mean over seeds "
+    "and its 95 % interval",
+    "robustness.png": "Return of the last checkpoint over the realised missing ratio, sampled "
+    "actions: interquartile mean over seeds and its 95 % interval",
+    "robustness_mean_actions.png": "The same with mean actions",
 }
 _TRAINING_TEXT = (
-    "Mean over seeds, each seed's own number in brackets in the order of the seeds. Return: raw, "
-    "sampled actions, mean of the last 100 training episodes. Missing ratio: realised share over "
-    "all components, mean over the whole run. Log-likelihood: nats per observed entry, normalised "
-    "units, mean of the last tenth of the run. Steps/s: whole training loop, start-up and "
-    "evaluation excluded, on whatever else the machine was doing."
+    "Return: raw, sampled actions, mean of the last 100 training episodes; **interquartile mean** "
+    "over seeds [95 % interval] (each seed's own). Of fewer than four seeds the interquartile mean "
+    "is the mean, and the bootstrap interval of three seeds is their range: it says how far they "
+    "lie apart, not where a fourth would fall. The other columns are means over seeds. Missing "
+    "ratio: realised share over all components, mean over the whole run. Log-likelihood: nats per "
+    "observed entry, normalised units, mean of the last tenth of the run. Steps/s: whole training "
+    "loop, start-up and evaluation excluded, on whatever else the machine was doing."
 )
 _EVALUATION_TEXT = (
-    "Mean over seeds of the mean raw return, each seed's own in brackets. Normalisation frozen, "
-    "noise as in training. Missing ratio and log-likelihood: as above, sampled actions."
+    "Mean raw return of the episodes of a seed; **interquartile mean** over seeds [95 % bootstrap "
+    "interval], then what that is of the same agents' return with nothing missing, where that was "
+    "evaluated and is positive. Normalisation frozen, noise as in training. Missing ratio: "
+    "realised share over all components, mean over the methods of the row."
+)
+_AGGREGATE_TEXT = (
+    "Returns as shares of the paper's thresholds (below 1: under the threshold), **interquartile "
+    "mean** over all runs of all tasks [95 % interval, runs resampled within their task]."
+)
+_MARGIN_TEXT = (
+    "Where half of all entries may be missing: interquartile mean of drbpn's return over that of "
+    "the other method, less one [95 % bootstrap interval, both resampled]. Beside it what the "
+    "paper gives: its margins over DVRL at ratio .5. Runs of unequal length are compared as they "
+    "are; their steps stand in the table of training."
+)
+_EFFICIENCY_TEXT = (
+    "Complete, exact observations, within 2M environment steps. Top-10: the mean of the ten best "
+    "training episodes of a run, raw return, sampled actions; **interquartile mean** over seeds "
+    "(each seed's own). Steps to the threshold of the paper: when the mean of the last 100 "
+    "training episodes first reached it, each seed's own, to one rollout."
 )
 
 
-def _what(runs: Sequence[StudyRun]) -> str:
-    """Say in a list what was trained on what."""
-    lines = []
-    for members in grouped(runs):
-        first = members[0].group
-        seeds = ", ".join(str(run.settings.seed) for run in members)
-        frames = sorted({run.frames for run in members})
-        steps = " to ".join(f"{n:,}" for n in dict.fromkeys((frames[0], frames[-1])))
-        lines.append(
-            f"- {first['task']}, belief `{first['belief']}`, trained on {first['trained_on']} with "
-            f"noise sigma {first['noise_sigma']:g}: seeds {seeds}, {steps} environment steps"
-        )
-        lines += [
-            f"  - `{run.name}` is not finished: {run.frames:,} of "
-            f"{run.settings.total_frames:,} steps"
-            for run in members
-            if not run.finished
-        ]
-    return "\n".join(lines)
+def _unfinished(runs: Sequence[StudyRun]) -> str:
+    """Say in a list which runs have not come to their end."""
+    return "\n".join(
+        f"- `{run.name}` is not finished: {run.frames:,} of {run.settings.total_frames:,} steps"
+        for run in runs
+        if not run.finished
+    )
 
 
-def _training_table(runs: Sequence[StudyRun], summary: Sequence[Mapping[str, Any]]) -> str:
+# Tables ---------------------------------------------------------------------------------------
+
+
+def _training_table(runs: Sequence[StudyRun], summary: Sequence[Row]) -> str:
     rows = []
     for members in grouped(runs):
         group = members[0].group
         found = {row["quantity"]: row for row in summary if _belongs(row, group)}
-        cells = [_cell(found[quantity]) for _, quantity in _TRAINING_COLUMNS]
+        first, *others = (found[quantity] for _, quantity in _TRAINING_COLUMNS)
+        frames = sorted({run.frames for run in members})
+        steps = " to ".join(f"{n:,}" for n in dict.fromkeys((frames[0], frames[-1])))
+        cells = [_with_seeds(first), *(_number(row["mean"]) for row in others)]
+        seeds = ", ".join(str(run.settings.seed) for run in members)
         rows.append(
-            [*_group_cells(group), ", ".join(str(r.settings.seed) for r in members), *cells]
+            [group["task"], f"`{group['method']}`", _trained_on(group), seeds, steps, *cells]
         )
-    head = ["task", "belief", "trained on", "seeds", *(name for name, _ in _TRAINING_COLUMNS)]
+    head = ["task", "method", "trained on", "seeds", "steps", *(n for n, _ in _TRAINING_COLUMNS)]
     return _table(head, rows)
 
 
-def _evaluation_table(summary: Sequence[Mapping[str, Any]]) -> str:
-    rows: dict[tuple[Any, ...], dict[tuple[str, str], str]] = {}
+def _evaluation_tables(summary: Sequence[Row]) -> list[str]:
+    """Return a heading and a table for each task, training corruption and kind of action."""
+    tables: dict[tuple[str, str, str], dict[str, dict[str, dict[str, Row]]]] = {}
     for row in summary:
         if row["quantity"].startswith("evaluation"):
-            cells = rows.setdefault((*_group_cells(row), row["point"]), {})
-            cells[row["quantity"], row["mode"]] = _cell(row)
-    columns = {
-        "missing ratio": ("evaluation missing ratio", "sampled"),
-        "return, sampled actions": ("evaluation return", "sampled"),
-        "of the return with nothing missing": (KEPT, "sampled"),
-        "return, mean actions": ("evaluation return", "mean"),
-        "log-likelihood": ("evaluation log-likelihood", "sampled"),
-    }
-    if not rows:
+            table = tables.setdefault((row["task"], _trained_on(row), row["mode"]), {})
+            line = table.setdefault(row["point"], {})
+            line.setdefault(row["method"], {})[row["quantity"]] = row
+    parts = []
+    for (task, trained_on, mode), table in tables.items():
+        methods = list(dict.fromkeys(method for line in table.values() for method in line))
+        rows = []
+        for point, line in table.items():
+            ratios = [line[m]["evaluation missing ratio"]["mean"] for m in methods if m in line]
+            known = [ratio for ratio in ratios if ratio is not None]
+            ratio = _number(sum(known) / len(known)) if known else ""
+            rows.append([point, ratio, *(_evaluated(line.get(method, {})) for method in methods)])
+        parts.append(f"### {task}, trained on {trained_on}, {_MODES[mode]}")
+        head = ["evaluated on", "missing ratio", *(f"`{method}`" for method in methods)]
+        parts.append(_table(head, rows))
+    return parts
+
+
+def _evaluated(quantities: Mapping[str, Row]) -> str:
+    if "evaluation return" not in quantities:
         return ""
-    return _table(
-        ["task", "belief", "trained on", "evaluated on", *columns],
-        [[*key, *(cells.get(c, "") for c in columns.values())] for key, cells in rows.items()],
-    )
+    text = _with_interval(quantities["evaluation return"])
+    kept = quantities.get(KEPT)
+    return text if kept is None else f"{text} {100 * kept['iqm']:.0f} %"
 
 
-def _belongs(row: Mapping[str, Any], group: Mapping[str, Any]) -> bool:
-    return all(row[key] == value for key, value in group.items())
+def _aggregate_table(aggregate: Sequence[Row]) -> str:
+    methods = list(dict.fromkeys(row["method"] for row in aggregate))
+    lines: dict[tuple[str, str, str], dict[str, str]] = {}
+    for row in aggregate:
+        key = (row["trained_on"], row["point"], _MODES[row["mode"]])
+        lines.setdefault(key, {})[row["method"]] = _with_interval(row)
+    head = ["trained on", "evaluated on", "actions", *(f"`{method}`" for method in methods)]
+    return _table(head, [[*key, *(c.get(m, "") for m in methods)] for key, c in lines.items()])
 
 
-def _group_cells(group: Mapping[str, Any]) -> list[str]:
-    noise = f", sigma {group['noise_sigma']:g}"
-    return [group["task"], f"`{group['belief']}`", f"{group['trained_on']}{noise}"]
+def _margin_table(margins: Sequence[Row]) -> str:
+    head = ["task", "trained on", "evaluated on", "actions", "over", "margin", "paper"]
+    rows = [
+        [
+            row["task"],
+            row["trained_on"],
+            row["point"],
+            _MODES[row["mode"]],
+            f"`{row['over']}`",
+            _percent(row["margin"])
+            + (
+                f" [{_percent(row['low'])}, {_percent(row['high'])}]"
+                if row["low"] is not None
+                else ""
+            ),
+            "" if row["paper"] is None else _percent(row["paper"]),
+        ]
+        for row in margins
+    ]
+    return _table(head, rows)
 
 
-def _cell(row: Mapping[str, Any]) -> str:
-    """Return the mean with every seed's own number beside it."""
+def _efficiency_table(efficiency: Sequence[Row]) -> str:
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in efficiency:
+        groups.setdefault((row["task"], row["method"]), []).append(row)
+    rows = []
+    for (task, method), members in groups.items():
+        threshold = THRESHOLDS.get(task_family(task))
+        steps = [
+            f"{row['steps_to_threshold']:,}"
+            if row["steps_to_threshold"] is not None
+            else f"not reached in {row['frames']:,}"
+            for row in members
+        ]
+        rows.append(
+            [
+                task,
+                f"`{method}`",
+                ", ".join(str(row["seed"]) for row in members),
+                _top(members),
+                "" if threshold is None else f"{threshold:g}",
+                "" if threshold is None else ", ".join(steps),
+            ]
+        )
+    head = ["task", "method", "seeds", "top-10 return", "threshold", "steps to the threshold"]
+    return _table(head, rows)
+
+
+# Cells ----------------------------------------------------------------------------------------
+
+
+def _top(members: Sequence[Row]) -> str:
+    values = [row["top_10_return"] for row in members]
+    own = ", ".join(_number(value) or "no episodes.csv" for value in values)
+    if None in values:
+        return own
+    return f"**{_number(float(interquartile_mean(np.array(values))))}** ({own})"
+
+
+def _with_seeds(row: Row) -> str:
+    """Return an interquartile mean with its interval and every seed's own number."""
     own = [part.split("=", 1)[1] for part in row["per_seed"].split()]
     if all(value == "" for value in own):
         return ""
-    shown = ", ".join(_short(float(value)) if value else "none" for value in own)
-    mean = "none" if row["mean"] is None else _short(row["mean"])
-    return f"**{mean}** ({shown})" if len(own) > 1 else f"**{mean}**"
+    shown = ", ".join(_number(float(value)) if value else "none" for value in own)
+    return f"{_with_interval(row)} ({shown})" if len(own) > 1 else _with_interval(row)
 
 
-def _short(value: float) -> str:
+def _with_interval(row: Row) -> str:
+    mean = "none" if row["iqm"] is None else _number(row["iqm"])
+    if row["low"] is None:
+        return f"**{mean}**"
+    return f"**{mean}** [{_number(row['low'])}, {_number(row['high'])}]"
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
     if abs(value) >= 100:
         return f"{value:.0f}"
     return f"{value:.3f}" if abs(value) < 1 else f"{value:.2f}"
 
 
+def _percent(share: float) -> str:
+    return f"{100 * share:+.0f} %"
+
+
+def _belongs(row: Row, group: Row) -> bool:
+    return all(row[key] == value for key, value in group.items())
+
+
+def _trained_on(group: Row) -> str:
+    return f"{group['trained_on']}, sigma {group['noise_sigma']:g}"
+
+
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _commands(runs: Sequence[StudyRun], out: Path, options: Sequence[str]) -> list[str]:
-    """Return the commands from nothing to this page."""
-    evaluations = [evaluation_command(run) for run in runs]
-    return [
-        *(training_command(run) for run in runs),
-        *(command for command in evaluations if command is not None),
-        report_command(runs, out, options),
-    ]
 
 
 def _versions(runs: Sequence[StudyRun]) -> str:
@@ -185,9 +313,11 @@ def csv_cells(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Return rows with every cell as text, numbers in one fixed form.
 
     Args:
-        rows: of a table.
+        rows: of a table; ``values`` is left out, its numbers stand in other columns.
 
     Returns:
         The rows to write.
     """
-    return [{key: format_number(value) for key, value in row.items()} for row in rows]
+    return [
+        {key: format_number(value) for key, value in row.items() if key != "values"} for row in rows
+    ]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from assembly.errors import UserError
-from assembly.run_folder import read_config
+from assembly.run_folder import CELL_FILE, read_config
 from assembly.settings import MissingnessSettings, Settings, read_settings
 
 Row = dict[str, Any]
@@ -32,7 +32,10 @@ class StudyRun:
         settings: the same, checked.
         versions: what it was made with.
         training: rows of metrics.csv, numbers; None where a cell is empty.
+        episodes: rows of episodes.csv; none where it is not there.
         evaluations: rows of :func:`_evaluations`.
+        study: the study of recipes/study.py that it is a cell of; None: it was run by itself.
+        method: what the study calls it; the belief module's name where it was run by itself.
     """
 
     name: str
@@ -40,7 +43,10 @@ class StudyRun:
     settings: Settings
     versions: Mapping[str, str]
     training: list[Row]
+    episodes: list[Row]
     evaluations: list[Row]
+    study: str | None
+    method: str
 
     @property
     def frames(self) -> int:
@@ -60,7 +66,7 @@ class StudyRun:
         s = self.settings
         return {
             "task": s.env.env_id,
-            "belief": str(s.belief.get("name", "")),
+            "method": self.method,
             "trained_on": point_name(s.missingness),
             "noise_sigma": s.noise.sigma,
         }
@@ -124,7 +130,7 @@ def read_study(folders: Sequence[Path], *, unfinished: bool = False) -> list[Stu
         unfinished: whether runs that have not come to their end are taken.
 
     Returns:
-        The runs, sorted by task, belief, training corruption, seed.
+        The runs, sorted by task, method, training corruption, seed.
 
     Raises:
         UserError: if a folder can't be read, a run is not finished, or runs of one mean differ
@@ -160,12 +166,13 @@ def grouped(runs: Sequence[StudyRun]) -> list[list[StudyRun]]:
 
 
 def _check_group(members: Sequence[StudyRun]) -> None:
-    first, seeds = members[0], {}
+    first = members[0]
+    seeds: dict[int, StudyRun] = {}
     for run in members:
         twin = seeds.setdefault(run.settings.seed, run)
         if twin is not run:
             raise UserError(
-                f"`{twin.name}` and `{run.name}` are the same task, belief and corruption with the "
+                f"`{twin.name}` and `{run.name}` are the same task, method and corruption with the "
                 f"same seed {run.settings.seed}: report them apart."
             )
         differing = _differing(first.config, run.config)
@@ -211,9 +218,31 @@ def _read_run(folder: Path, name: str) -> StudyRun:
     training = _read_csv(folder / "metrics.csv", {"frames", "return", "missing_ratio"})
     if not training:
         raise UserError(f"`{folder}` holds no finished rollout: metrics.csv is empty.")
+    path = folder / "episodes.csv"
+    study, method = _cell(folder)
     return StudyRun(
-        name, config, settings, _read_versions(folder), training, _evaluations(folder, settings)
+        name,
+        config,
+        settings,
+        _read_versions(folder),
+        training,
+        _read_csv(path, {"frames", "return"}) if path.is_file() else [],
+        _evaluations(folder, settings),
+        study,
+        method or str(settings.belief.get("name", "")),
     )
+
+
+def _cell(folder: Path) -> tuple[str | None, str | None]:
+    """Return study and method of a run that is a cell of a study."""
+    path = folder / CELL_FILE
+    if not path.is_file():
+        return None, None
+    try:
+        cell = json.loads(path.read_text(encoding="utf-8"))
+        return str(cell["study"]), cell["choices"].get("method")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"`{path}` can't be read: remove it, or run the cell again.") from error
 
 
 def _read_versions(folder: Path) -> dict[str, str]:
@@ -329,13 +358,26 @@ def mean_of_known(values: Iterable[Any]) -> Any:
 
 
 def point_order(point: str) -> tuple[str, float]:
-    """Return what points are sorted by: none first, then by mechanism and eta.
+    """Return what points are sorted by: none first, then by kind and ratio.
 
     Args:
-        point: ``mechanism:eta``.
+        point: ``mechanism:eta``, and what else tells it from others after a blank.
 
     Returns:
         A key for ``sorted``.
     """
-    mechanism, _, eta = point.partition(":")
-    return ("" if mechanism == "none" else mechanism, float(eta))
+    kind = point_kind(point)
+    return "" if kind == "none" else kind, float(point.partition(":")[2].split(" ")[0])
+
+
+def point_kind(point: str) -> str:
+    """Return what points have in common that differ in their nominal ratio alone.
+
+    Args:
+        point: such as ``mcar:0.5`` or ``reduction:0.5 random``.
+
+    Returns:
+        Such as ``mcar`` or ``reduction random``.
+    """
+    mechanism, _, rest = point.partition(":")
+    return " ".join([mechanism, *rest.split(" ")[1:]])

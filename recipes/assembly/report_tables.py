@@ -8,7 +8,10 @@ import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from assembly.report_runs import Row, StudyRun, grouped, mean_of_known, point_order
+from assembly.report_statistics import interquartile_mean, interval
 
 
 def training_rows(run: StudyRun, count: int) -> list[Row]:
@@ -91,8 +94,10 @@ def summary_rows(runs: Sequence[StudyRun]) -> list[Row]:
         runs: of a study.
 
     Returns:
-        Rows ``task, belief, trained_on, noise_sigma, quantity, point, mode, seeds, mean, std,
-        per_seed``; std between seeds, empty for one; per_seed ``seed=number`` joined by spaces.
+        Rows ``task, method, trained_on, noise_sigma, quantity, point, mode, seeds, mean, std, iqm,
+        low, high, per_seed``: std between seeds, interquartile mean and the ends of its 95 %
+        interval, empty for one seed; per_seed ``seed=number`` joined by spaces. ``values``, the
+        same as numbers, is empty where a seed has none, and is no column of summary.csv.
     """
     rows = []
     for members in grouped(runs):
@@ -135,15 +140,21 @@ def _summary(
 ) -> Row:
     values = {run.settings.seed: number(run) for run in members}
     known = [value for value in values.values() if value is not None]
+    # A mean that leaves out a seed would be no mean over the seeds.
+    known = known if len(known) == len(values) else []
+    ends = interval([known]) if known else None
     return members[0].group | {
         "quantity": quantity,
         "point": point,
         "mode": mode,
         "seeds": len(values),
-        # A mean that leaves out a seed would be no mean over the seeds.
-        "mean": mean_of_known(known) if len(known) == len(values) else None,
-        "std": statistics.stdev(known) if len(known) == len(values) > 1 else None,
+        "mean": mean_of_known(known),
+        "std": statistics.stdev(known) if len(known) > 1 else None,
+        "iqm": float(interquartile_mean(np.array(known))) if known else None,
+        "low": None if ends is None else float(ends[0]),
+        "high": None if ends is None else float(ends[1]),
         "per_seed": " ".join(f"{seed}={format_number(v)}" for seed, v in sorted(values.items())),
+        "values": known,
     }
 
 

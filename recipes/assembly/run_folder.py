@@ -30,6 +30,9 @@ _PACKAGES = (
     "hydra-core",
 )
 
+# Of a run that recipes/study.py started: which cell of which study it is.
+CELL_FILE = "cell.json"
+
 # Settings that came after the first run folders, with the value that says what a run without them
 # did: a folder stays readable when a setting is added. "group.key": value
 _LATER_SETTINGS: dict[str, Any] = {

@@ -14,10 +14,9 @@ from pathlib import Path
 
 from assembly.checkpoint import checkpoint_frames
 from assembly.errors import UserError
-from assembly.run_folder import read_config, write_whole
+from assembly.run_folder import CELL_FILE, read_config, write_whole
 from assembly.study_grid import Cell, differing
 
-CELL_FILE = "cell.json"
 _TAIL = 8192  # bytes: longer than any line of a table or log that is read from its end
 
 

@@ -1,0 +1,208 @@
+"""What the DRBPN paper gives to compare with: thresholds of the return, margins over DVRL."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from assembly.report_runs import Row, StudyRun, grouped
+from assembly.report_statistics import interquartile_mean, interval, ratio_of_means
+
+# Returns that an agent shall reach on complete, exact observations, v4, within 2M steps.
+THRESHOLDS = {
+    "HalfCheetah": 2100.0,
+    "Hopper": 2000.0,
+    "Ant": 2500.0,
+    "InvertedDoublePendulum": 9100.0,
+    "InvertedPendulum": 950.0,
+    "Swimmer": 90.0,
+    "Reacher": -7.0,
+    "Walker2d": 3000.0,
+}
+WITHIN = 2_000_000  # environment steps
+# By how much the paper's DRBPN is ahead of its DVRL at missing ratio .5.
+MARGINS_OVER_DVRL = {"Hopper": 0.20, "Walker2d": 0.75, "HalfCheetah": 1.00}
+
+_TOP = 10  # episodes
+_WINDOW = 100  # episodes of the mean that has to reach the threshold
+
+
+def task_family(task: str) -> str:
+    """Return a Gymnasium id without its version.
+
+    Args:
+        task: such as ``Hopper-v4``.
+
+    Returns:
+        Such as ``Hopper``.
+    """
+    return task.rpartition("-")[0] or task
+
+
+def top_return(run: StudyRun) -> float | None:
+    """Return the mean of the ten best training episodes within 2M steps, sampled actions.
+
+    Args:
+        run: the run.
+
+    Returns:
+        Raw return; None where the run has fewer than ten episodes or no episodes.csv.
+    """
+    best = sorted((r["return"] for r in run.episodes if r["frames"] <= WITHIN), reverse=True)
+    return sum(best[:_TOP]) / _TOP if len(best) >= _TOP else None
+
+
+def steps_to_threshold(run: StudyRun, threshold: float) -> int | None:
+    """Return when the mean of the last 100 training episodes first reached a threshold.
+
+    Args:
+        run: the run.
+        threshold: raw return.
+
+    Returns:
+        Environment steps, to one rollout; None where it was not reached within 2M steps. A mean
+        over fewer episodes does not count: the first ones may be lucky.
+    """
+    reached = (
+        int(row["frames"])
+        for row in run.training
+        if row["frames"] <= WITHIN
+        and (row.get("episodes") or 0) >= _WINDOW
+        and row["return"] is not None
+        and row["return"] >= threshold
+    )
+    return next(reached, None)
+
+
+def efficiency_rows(runs: Sequence[StudyRun]) -> list[Row]:
+    """Return sample efficiency on complete, exact observations.
+
+    Args:
+        runs: of a study; those with missing entries or noise are left out.
+
+    Returns:
+        Rows ``task, method, frames, seed, top_10_return, threshold, steps_to_threshold``; an empty
+        last cell: not reached.
+    """
+    rows = []
+    for run in runs:
+        if run.group["trained_on"] != "none:0" or run.group["noise_sigma"]:
+            continue
+        threshold = THRESHOLDS.get(task_family(run.group["task"]))
+        rows.append(
+            {
+                "task": run.group["task"],
+                "method": run.group["method"],
+                "seed": run.settings.seed,
+                "frames": run.frames,
+                "top_10_return": top_return(run),
+                "threshold": threshold,
+                "steps_to_threshold": (
+                    None if threshold is None else steps_to_threshold(run, threshold)
+                ),
+            }
+        )
+    return rows
+
+
+def margin_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row]:
+    """Return by how much drbpn is ahead of every other method where half of all may be missing.
+
+    Args:
+        runs: of a study.
+        summary: rows of :func:`assembly.report_tables.summary_rows`.
+
+    Returns:
+        Rows ``task, trained_on, point, mode, over, margin, low, high, paper``: a ratio of
+        interquartile means minus one with its 95 % interval, both methods resampled.
+    """
+    returns = {
+        (*_place(row), row["method"]): row["values"]
+        for row in summary
+        if row["quantity"] == "evaluation return" and row["point"].endswith(":0.5")
+    }
+    order = list(dict.fromkeys(members[0].group["method"] for members in grouped(runs)))
+    rows = []
+    for (*place, method), values in returns.items():
+        if method != "drbpn":
+            continue
+        for other in order:
+            against = returns.get((*place, other))
+            # Of a return that is not positive no share can be told.
+            if other == method or not values or not against or min(against) <= 0:
+                continue
+            rows.append(_margin(place, other, values, against))
+    return rows
+
+
+def aggregate_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row]:
+    """Return scores over all tasks: returns as shares of the paper's threshold of their task.
+
+    Args:
+        runs: of a study.
+        summary: rows of :func:`assembly.report_tables.summary_rows`.
+
+    Returns:
+        Rows ``trained_on, point, mode, method, tasks, runs, iqm, low, high`` where two tasks or
+        more with a positive threshold were evaluated: interquartile mean over all runs of all
+        tasks, its 95 % interval with runs resampled within their task. A method that lacks one of
+        the tasks, or a seed of one, has no row: it would be compared over others.
+    """
+    found: dict[tuple[str, str, str], dict[str, dict[str, list[float]]]] = {}
+    for row in summary:
+        threshold = THRESHOLDS.get(task_family(row["task"]), 0.0)
+        if row["quantity"] == "evaluation return" and threshold > 0 and row["values"]:
+            task, *place = _place(row)
+            by_method = found.setdefault((place[0], place[1], place[2]), {})
+            scores = [value / threshold for value in row["values"]]
+            by_method.setdefault(row["method"], {})[task] = scores
+    rows = []
+    for (trained_on, point, mode), by_method in found.items():
+        tasks = sorted({task for scores in by_method.values() for task in scores})
+        for method, scores in by_method.items():
+            if len(tasks) < 2 or len(scores) < len(tasks):
+                continue
+            strata = [scores[task] for task in tasks]
+            ends = interval(strata)
+            rows.append(
+                {
+                    "trained_on": trained_on,
+                    "point": point,
+                    "mode": mode,
+                    "method": method,
+                    "tasks": " ".join(tasks),
+                    "runs": sum(map(len, strata)),
+                    "iqm": float(interquartile_mean(np.concatenate(strata))),
+                    "low": None if ends is None else float(ends[0]),
+                    "high": None if ends is None else float(ends[1]),
+                }
+            )
+    return rows
+
+
+def _place(row: Row) -> tuple[str, str, str, str]:
+    return (
+        row["task"],
+        f"{row['trained_on']}, sigma {row['noise_sigma']:g}",
+        row["point"],
+        row["mode"],
+    )
+
+
+def _margin(place: Sequence[str], other: str, values: list[float], against: list[float]) -> Row:
+    ends = interval([values, against], ratio_of_means)
+    task, trained_on, point, mode = place
+    paper = MARGINS_OVER_DVRL.get(task_family(task)) if other == "dvrl" else None
+    ratio = interquartile_mean(np.array(values)) / interquartile_mean(np.array(against))
+    return {
+        "task": task,
+        "trained_on": trained_on,
+        "point": point,
+        "mode": mode,
+        "over": other,
+        "margin": float(ratio) - 1,
+        "low": None if ends is None else float(ends[0]) - 1,
+        "high": None if ends is None else float(ends[1]) - 1,
+        "paper": paper,
+    }
