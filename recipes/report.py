@@ -93,7 +93,7 @@ def _write_study(wanted: Any, out: Path, options: Options) -> None:
         summary = summary_rows(runs)
         tables = Tables(
             summary,
-            aggregate_rows(runs, summary),
+            aggregate_rows(summary),
             margin_rows(runs, summary),
             efficiency_rows(runs),
         )

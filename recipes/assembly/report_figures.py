@@ -19,6 +19,7 @@ _PANEL = (4.3, 3.1)  # inches
 _COLUMNS = 3
 _GRID = 200  # points of a curve
 _NOTHING = "none"
+_NAMES = {"mcar": "MCAR", "mar": "MAR", "nmar": "NMAR"}
 
 _Group = Sequence[StudyRun]
 
@@ -89,7 +90,7 @@ def robustness(runs: Sequence[StudyRun], mode: str = "sampled") -> Figure | None
                 for label, (members, points) in own.items():
                     _draw_points(axis, members, points, mode, colours[label], label, nominal)
                     nominal = False  # once a panel is enough
-                axis.set_title(f"{task}, {kind}")
+                axis.set_title(f"{task}, {_NAMES.get(kind, kind)}")
                 axis.set_xlim(left=-0.02)
                 axis.set_xlabel("realised missing ratio")
                 low, high = min(0.0, axis.dataLim.ymin), max(0.0, axis.dataLim.ymax)

@@ -85,14 +85,15 @@ FIGURE_TEXTS = {
     "learning_curves.png": "Training return over environment steps: interquartile mean over seeds "
     "and its 95 % interval",
     "robustness.png": "Return of the last checkpoint over the realised missing ratio, sampled "
-    "actions: interquartile mean over seeds and its 95 % interval",
+    "actions: interquartile mean over seeds and its 95 % interval; in grey the nominal ratio",
     "robustness_mean_actions.png": "The same with mean actions",
 }
 _TRAINING_TEXT = (
     "Return: raw, sampled actions, mean of the last 100 training episodes; **interquartile mean** "
     "over seeds [95 % interval] (each seed's own). Of fewer than four seeds the interquartile mean "
-    "is the mean, and the bootstrap interval of three seeds is their range: it says how far they "
-    "lie apart, not where a fourth would fall. The other columns are means over seeds. Missing "
+    "is the mean, and the bootstrap interval of three is hardly narrower than their range: it says "
+    "how far they lie apart, not where a fourth would fall. The other columns are means over "
+    "seeds. Missing "
     "ratio: realised share over all components, mean over the whole run. Log-likelihood: nats per "
     "observed entry, normalised units, mean of the last tenth of the run. Steps/s: whole training "
     "loop, start-up and evaluation excluded, on whatever else the machine was doing."
@@ -200,12 +201,7 @@ def _margin_table(margins: Sequence[Row]) -> str:
             row["point"],
             _MODES[row["mode"]],
             f"`{row['over']}`",
-            _percent(row["margin"])
-            + (
-                f" [{_percent(row['low'])}, {_percent(row['high'])}]"
-                if row["low"] is not None
-                else ""
-            ),
+            _margin(row),
             "" if row["paper"] is None else _percent(row["paper"]),
         ]
         for row in margins
@@ -273,6 +269,12 @@ def _number(value: float | None) -> str:
     if abs(value) >= 100:
         return f"{value:.0f}"
     return f"{value:.3f}" if abs(value) < 1 else f"{value:.2f}"
+
+
+def _margin(row: Row) -> str:
+    if row["low"] is None:
+        return _percent(row["margin"])
+    return f"{_percent(row['margin'])} [{_percent(row['low'])}, {_percent(row['high'])}]"
 
 
 def _percent(share: float) -> str:

@@ -136,11 +136,10 @@ def margin_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row]:
     return rows
 
 
-def aggregate_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row]:
+def aggregate_rows(summary: Sequence[Row]) -> list[Row]:
     """Return scores over all tasks: returns as shares of the paper's threshold of their task.
 
     Args:
-        runs: of a study.
         summary: rows of :func:`assembly.report_tables.summary_rows`.
 
     Returns:
@@ -159,11 +158,11 @@ def aggregate_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row
             by_method.setdefault(row["method"], {})[task] = scores
     rows = []
     for (trained_on, point, mode), by_method in found.items():
-        tasks = sorted({task for scores in by_method.values() for task in scores})
-        for method, scores in by_method.items():
-            if len(tasks) < 2 or len(scores) < len(tasks):
+        tasks = sorted({task for by_task in by_method.values() for task in by_task})
+        for method, by_task in by_method.items():
+            if len(tasks) < 2 or len(by_task) < len(tasks):
                 continue
-            strata = [scores[task] for task in tasks]
+            strata = [by_task[task] for task in tasks]
             ends = interval(strata)
             rows.append(
                 {
