@@ -16,6 +16,8 @@ from torchrl.envs import (
 )
 
 from assembly.errors import UserError
+from assembly.sensor_groups import sensor_groups
+from assembly.sensors import sensor_names
 from assembly.settings import (
     EnvSettings,
     MissingnessSettings,
@@ -26,8 +28,10 @@ from torchrl_drbpn import (
     MaskedObservationNorm,
     ObservationMissingness,
     ObservationNoise,
+    ObservationSpikes,
     PreviousAction,
     RunningReturnScale,
+    SensorOutages,
     seed_env,
 )
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
@@ -82,19 +86,16 @@ def make_environment(
     base = _make_base(env, num_envs, num_threads)
     transforms: list[Transform] = [PreviousAction()]
     # The first transform that corrupts writes down what it was given.
-    key, noisy = "complete_observation" if complete else None, noise.sigma > 0
-    if noisy:
+    key = "complete_observation" if complete else None
+    if noise.sigma > 0:
         transforms.append(ObservationNoise(noise.scale * noise.sigma, complete_key=key))
-    # "none" still writes `observed`: every entry is there.
-    none = missingness.mechanism == "none"
+        key = None
+    if noise.spike_probability > 0:
+        spikes = ObservationSpikes(noise.spike_probability, noise.spike_std, complete_key=key)
+        transforms.append(spikes)
+        key = None
     transforms += [
-        ObservationMissingness(
-            "mcar" if none else _MECHANISMS[missingness.mechanism],
-            0.0 if none else missingness.eta,
-            always_observed=missingness.always_observed,
-            mechanism_seed=missingness.mechanism_seed,
-            complete_key=None if noisy else key,
-        ),
+        make_missingness(env, missingness, base.observation_spec["observation"].shape[-1], key),
         *before_normalisation,
         MaskedObservationNorm(clip=normalisation.observation_clip),
         RunningReturnScale(
@@ -110,6 +111,37 @@ def make_environment(
     out = TransformedEnv(base, Compose(*transforms))
     seed_env(out, seed)
     return out
+
+
+def make_missingness(
+    env: EnvSettings, missingness: MissingnessSettings, obs_dim: int, complete_key: str | None
+) -> Transform:
+    """Build the transform that takes entries away; it writes ``observed`` in every case.
+
+    Args:
+        env: which robot; its sensors' names say what fails together.
+        missingness: which entries do not arrive.
+        obs_dim: components of an observation.
+        complete_key: where the complete observation is recorded; None: nowhere.
+
+    Returns:
+        The transform.
+    """
+    if missingness.mechanism == "outages":
+        return SensorOutages(
+            missingness.eta,
+            missingness.mean_length,
+            groups=sensor_groups(sensor_names(env.id, env.version, obs_dim), missingness.group_by),
+            complete_key=complete_key,
+        )
+    none = missingness.mechanism == "none"
+    return ObservationMissingness(
+        "mcar" if none else _MECHANISMS[missingness.mechanism],
+        0.0 if none else missingness.eta,
+        always_observed=missingness.always_observed,
+        mechanism_seed=missingness.mechanism_seed,
+        complete_key=complete_key,
+    )
 
 
 def task_dims(env: EnvSettings) -> tuple[int, int]:

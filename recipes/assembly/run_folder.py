@@ -39,6 +39,10 @@ _LATER_SETTINGS: dict[str, Any] = {
     "algo": {"_target_": "assembly.algorithms.ppo.build", "name": "ppo"},
     "heads.critic_input": "features",
     "optim.recompute_advantages": False,
+    "missingness.mean_length": 1.0,
+    "missingness.group_by": "sensor",
+    "noise.spike_probability": 0.0,
+    "noise.spike_std": 0.0,
 }
 
 

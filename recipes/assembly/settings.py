@@ -10,10 +10,13 @@ from math import inf
 from typing import Any, TypeVar
 
 from assembly.errors import UserError
+from torchrl_drbpn.functional import outage_rates
 
 T = TypeVar("T")
 
 _SEED_LIMIT = 2**63  # of torch's generators
+MECHANISMS = ("none", "mcar", "mar", "nmar", "outages")
+GROUPINGS = ("sensor", "joint", "kind")
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class MissingnessSettings:
     eta: float
     always_observed: float
     mechanism_seed: int
+    mean_length: float
+    group_by: str
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,8 @@ class NoiseSettings:
 
     sigma: float
     scale: float
+    spike_probability: float
+    spike_std: float
 
 
 @dataclass(frozen=True)
@@ -238,7 +245,8 @@ def _check(s: Settings) -> None:
     choices = {
         "env.backend": (s.env.backend, ("gymnasium", "envpool")),
         "env.version": (s.env.version, ("v4", "v5")),
-        "missingness.mechanism": (s.missingness.mechanism, ("none", "mcar", "mar", "nmar")),
+        "missingness.mechanism": (s.missingness.mechanism, MECHANISMS),
+        "missingness.group_by": (s.missingness.group_by, GROUPINGS),
         "heads.critic_input": (s.heads.critic_input, ("features", "complete")),
         "loss.loss_critic_type": (s.loss.loss_critic_type, ("l1", "l2", "smooth_l1")),
         "loss.normalize": (s.loss.normalize, ("entry", "step")),
@@ -249,9 +257,11 @@ def _check(s: Settings) -> None:
             raise UserError(f"`{name}` must be one of {', '.join(valid)}, got {given!r}.")
     for mode in s.evaluation.modes:
         check_mode(mode)
+    check_outages(s.missingness)
     unit_interval = {
         "missingness.eta": s.missingness.eta,
         "missingness.always_observed": s.missingness.always_observed,
+        "noise.spike_probability": s.noise.spike_probability,
         "loss.gamma": s.loss.gamma,
         "loss.lmbda": s.loss.lmbda,
     }
@@ -282,6 +292,7 @@ def _check(s: Settings) -> None:
         "seed": s.seed,
         "noise.sigma": s.noise.sigma,
         "noise.scale": s.noise.scale,
+        "noise.spike_std": s.noise.spike_std,
         "optim.lr": s.optim.lr,
         "loss.critic_coeff": s.loss.critic_coeff,
         "loss.entropy_coeff": s.loss.entropy_coeff,
@@ -309,6 +320,23 @@ def _check(s: Settings) -> None:
             f"`optim.minibatches` must divide the {sequences} sequences of a rollout, "
             f"got {s.optim.minibatches}."
         )
+
+
+def check_outages(missingness: MissingnessSettings) -> None:
+    """Check that there is a Markov chain with the ratio and the mean length of an outage.
+
+    Args:
+        missingness: any; only outages are looked at.
+
+    Raises:
+        UserError: if there is none.
+    """
+    if missingness.mechanism != "outages":
+        return
+    try:
+        outage_rates(missingness.eta, missingness.mean_length)
+    except ValueError as error:
+        raise UserError(f"missingness=outages: {error}") from error
 
 
 def check_mode(mode: str) -> None:
