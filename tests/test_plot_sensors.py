@@ -1,0 +1,269 @@
+"""What trained beliefs say about their sensors: `kept_sensors` and `recipes/plot_sensors.py`.
+
+Specified, on the committed Hopper runs: the model that is read is the one the filter predicts with;
+the sensors kept are those of `select_sensors` and tell more than most random ones; what is drawn
+along any order is what the library's update leaves; rankings do not depend on the state's basis.
+The recipe writes two pictures and a table, whole, and answers bad input with one line.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
+from recipe_tools import ROOT  # isort: skip
+
+import plot_sensors
+from assembly.errors import UserError
+from assembly.sensor_choice import SensorModel, kept_sensors, learned_sensors
+from assembly.sensor_figures import place_of_sensors, random_orders
+from assembly.trained import TrainedAgent, load_trained_agent
+from matplotlib.image import imread
+
+from torchrl_drbpn import (
+    BeliefFilterModule,
+    GaussianTransition,
+    LinearGaussianEmission,
+    functional,
+    select_sensors,
+)
+
+RUNS = ROOT / "results" / "mujoco-v4-1m" / "runs"
+NO_MODEL = ROOT / "results" / "beliefs-v4-500k" / "runs" / "hopper-v4-none-s0"
+OBS, ACTION = 11, 3
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*")
+
+
+@pytest.fixture(scope="module")
+def agents() -> list[TrainedAgent]:
+    return [load_trained_agent(RUNS / f"hopper-v4-s{seed}") for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def models(agents: list[TrainedAgent]) -> list[SensorModel]:
+    return [learned_sensors(trained) for trained in agents]
+
+
+def filtered(model: SensorModel, rows: list[int]) -> torch.Tensor:
+    """The covariance that the library's update leaves with these sensors."""
+    observed = torch.zeros(OBS, dtype=torch.bool)
+    observed[rows] = True
+    P = model.predicted_cov
+    belief = functional.Belief(torch.zeros(len(P), dtype=P.dtype), P)
+    nothing = torch.zeros(OBS, dtype=P.dtype)
+    return functional.update(
+        belief, nothing, observed, model.emission_matrix, model.emission_cov
+    ).cov
+
+
+# The model --------------------------------------------------------------------------------------
+
+
+def test_the_observation_covariance_is_that_of_a_step_inside_an_episode(
+    agents: list[TrainedAgent], models: list[SensorModel]
+) -> None:
+    module = BeliefFilterModule(
+        agents[0].agent.belief.filter, out_keys=[("belief", "innovation_cov")]
+    )
+    data = TensorDict(
+        {
+            "observation": torch.zeros(1, OBS),
+            "observed": torch.rand(1, OBS, generator=torch.Generator().manual_seed(0)) < 0.5,
+            "previous_action": torch.ones(1, ACTION),
+            "is_init": torch.zeros(1, 1, dtype=torch.bool),
+            ("recurrent", "mean"): torch.ones(1, OBS),
+            ("recurrent", "age"): torch.ones(1, 1, dtype=torch.int64),
+        },
+        [1],
+    )
+    with torch.no_grad():
+        said = module(data)["belief", "innovation_cov"][0]
+    torch.testing.assert_close(said.double(), models[0].observation_cov, rtol=1e-4, atol=1e-7)
+
+
+def test_the_noise_that_was_added_is_the_noise_that_was_learned(
+    models: list[SensorModel],
+) -> None:
+    """Where it lies above the floor of R (std 1e-2), and the model explains the sensor."""
+    for model in models:
+        learned = model.emission_cov.diagonal().sqrt()
+        loud = model.added_std > 0.015
+        assert int(loud.sum()) == 5
+        torch.testing.assert_close(learned[loud], model.added_std[loud], rtol=0.1, atol=0)
+
+
+# The choice -------------------------------------------------------------------------------------
+
+
+def test_the_kept_sensors_are_those_of_the_learned_model(
+    agents: list[TrainedAgent], models: list[SensorModel]
+) -> None:
+    everything = kept_sensors(agents[0], OBS)
+    assert sorted(everything) == list(range(OBS))
+    for count in (0, 1, 4):
+        assert kept_sensors(agents[0], count) == everything[:count]
+    space = agents[0].agent.belief.filter.state_space()
+    direct = select_sensors(space.emission_matrix, space.transition_cov, space.emission_cov, 4)
+    assert kept_sensors(agents[0], 4) == direct.indices.tolist()
+
+
+def test_the_kept_sensors_tell_more_than_nearly_all_random_ones(
+    agents: list[TrainedAgent], models: list[SensorModel]
+) -> None:
+    for trained, model in zip(agents, models, strict=True):
+        random = model.along(random_orders(400, OBS, 0))[0]
+        for count in (2, 4, 6):
+            kept = model.along(torch.tensor(kept_sensors(trained, count)))[0][-1]
+            assert (random[:, count - 1] <= kept + 1e-9).double().mean() > 0.99
+
+
+def test_a_belief_without_a_model_and_a_bad_count_are_refused(agents: list[TrainedAgent]) -> None:
+    with pytest.raises(UserError, match="`belief=none` has learned no H, P and R"):
+        kept_sensors(load_trained_agent(NO_MODEL), 3)
+    for count in (-1, OBS + 1):
+        with pytest.raises(UserError, match=f"`count` must be from 0 to the 11 .*got {count}"):
+            kept_sensors(agents[0], count)
+
+
+def test_a_covariance_that_depends_on_the_state_ranks_no_sensors() -> None:
+    trained = load_trained_agent(RUNS / "hopper-v4-s0")
+    trained.agent.belief.filter.transition = GaussianTransition(OBS, ACTION, cov_network=True)
+    with pytest.raises(UserError, match="`belief=drbpn` predicts another covariance at every"):
+        learned_sensors(trained)
+
+
+# What is drawn ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
+def test_along_an_order_is_what_update_leaves(models: list[SensorModel], full: bool) -> None:
+    model = models[1]
+    if full:
+        noise = LinearGaussianEmission(OBS, OBS, ACTION, cov="full", dtype=torch.float64)
+        with torch.no_grad():
+            noise.noise.raw += 0.05 * torch.randn(
+                OBS, OBS, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+            )
+        model = replace(model, emission_cov=noise.cov().detach())
+    H, P = model.emission_matrix, model.predicted_cov
+    orders = random_orders(3, OBS, 5)
+    information, left = model.along(orders)
+    for line, order in enumerate(orders.tolist()):
+        for k in range(OBS):
+            cov = filtered(model, order[: k + 1])
+            gained = 0.5 * (torch.logdet(P) - torch.logdet(cov))
+            share = (H @ cov @ H.mT).trace() / (H @ P @ H.mT).trace()
+            assert information[line, k] == pytest.approx(float(gained), abs=1e-9)
+            assert left[line, k] == pytest.approx(float(share), abs=1e-9)
+
+
+def test_along_the_chosen_orders_is_what_select_sensors_says(models: list[SensorModel]) -> None:
+    model = models[2]
+    H, P, R = model.emission_matrix, model.predicted_cov, model.emission_cov
+    chosen = select_sensors(H, P, R, OBS)
+    assert torch.equal(model.ranking("D"), chosen.indices)
+    torch.testing.assert_close(model.along(chosen.indices)[0], chosen.information)
+    chosen = select_sensors(H, P, R, OBS, criterion="A", target=H)
+    assert torch.equal(model.ranking("A"), chosen.indices)
+    share = chosen.objective / (H @ P @ H.mT).trace()
+    torch.testing.assert_close(model.along(chosen.indices)[1], share)
+
+
+def test_rankings_do_not_depend_on_the_basis_of_the_state(models: list[SensorModel]) -> None:
+    T = torch.randn(OBS, OBS, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    H = models[0].emission_matrix @ torch.linalg.inv(T)
+    moved = replace(models[0], emission_matrix=H, predicted_cov=T @ models[0].predicted_cov @ T.mT)
+    for criterion in ("D", "A"):
+        assert torch.equal(moved.ranking(criterion), models[0].ranking(criterion))
+
+
+def test_places_count_from_one_and_random_orders_follow_their_seed(
+    models: list[SensorModel],
+) -> None:
+    places = place_of_sensors(models, "D")
+    assert places.shape == (3, OBS)
+    for line, model in zip(places, models, strict=True):
+        assert line[model.ranking("D")[0]] == 1
+        assert sorted(line) == list(range(1, OBS + 1))
+    assert torch.equal(random_orders(5, 4, 1), random_orders(5, 4, 1))
+    assert not torch.equal(random_orders(5, 4, 1), random_orders(5, 4, 2))
+
+
+# The recipe -------------------------------------------------------------------------------------
+
+FILES = ["observation_covariance.png", "sensor_ranking.csv", "sensor_ranking.png"]
+
+
+def draw(run: Any, out: Path | None, **changes: Any) -> int:
+    base = {"run": run, "out": out and str(out), "correlation": True, "orders": 20, "seed": 0}
+    return plot_sensors.run(base | {"dpi": 50} | changes)
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(RUNS / "hopper-v4-s0", tmp_path / "hopper-v4-s0"))
+
+
+def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "sensors"
+    assert draw([str(RUNS / "hopper-v4-s1"), str(RUNS / "hopper-v4-s0")], out) == 0
+    assert sorted(path.name for path in out.iterdir()) == FILES
+    for name in (FILES[0], FILES[2]):
+        pixels = imread(out / name)[..., :3]
+        assert 0.01 < (pixels.min(-1) < 0.9).mean() < 0.9
+    with (out / "sensor_ranking.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * OBS
+    assert [row["training_seed"] for row in rows[:: 2 * OBS]] == ["0", "1"]
+    for start in range(0, len(rows), OBS):
+        part = rows[start : start + OBS]
+        assert [int(row["place"]) for row in part] == list(range(1, OBS + 1))
+        assert len({row["sensor"] for row in part}) == OBS
+        assert (np.diff([float(row["information"]) for row in part]) >= 0).all()
+        assert (np.diff([float(row["variance_left"]) for row in part]) <= 0).all()
+    assert rows[0]["sensor"] == "torso angular velocity"
+
+
+def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(copied: Path) -> None:
+    written = []
+    for _ in range(2):
+        assert draw(str(copied), None, correlation=False) == 0
+        written.append([(copied / name).read_bytes() for name in FILES])
+    assert written[0] == written[1]
+    wide = imread(copied / FILES[0]).shape[1]
+    assert draw(str(copied), None) == 0
+    assert imread(copied / FILES[0]).shape[1] > 1.5 * wide  # the correlations stand beside
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"run": None}, "`run` must name run folders"),
+        ({"run": "nowhere/*"}, "`run` must name run folders, nowhere/\\* matches none"),
+        ({"run": "nowhere"}, "`nowhere` must be a run folder"),
+        ({"run": str(RUNS / "hopper*"), "out": None}, "`out` must name a folder for .* 3 runs"),
+        ({"orders": 5}, "`orders` must be 20 or more"),
+        ({"dpi": 0}, "`dpi` 1 or more"),
+        ({"out": __file__}, "`out` must be a folder, .* is a file"),
+        ({"run": str(NO_MODEL)}, "`belief=none` has learned no H, P and R"),
+    ],
+)
+def test_bad_input_is_answered_with_one_line(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    options = {"run": str(RUNS / "hopper-v4-s0"), "out": tmp_path / "out"} | changes
+    with pytest.raises(UserError, match=message) as caught:
+        draw(**options)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
