@@ -1,8 +1,8 @@
 """Interquartile means and stratified bootstrap intervals, the same bytes on every machine.
 
 As ``rliable`` (Agarwal et al. 2021) defines them: a score is one run's, runs are resampled within
-their task. It can't be used: rliable 1.2 needs arch before 8, which can't be imported beside pandas
-3; and its draws follow NumPy's version. Few runs are not drawn at all: every resample is enumerated.
+their task. It is not used: rliable 1.2 needs arch before 8, which can't be imported beside pandas
+3, and its draws follow NumPy's version. Of few runs nothing is drawn: every resample is enumerated.
 """
 
 from __future__ import annotations
