@@ -1,0 +1,301 @@
+"""Calibration: consistency tests, coverage, reliability, proper scores.
+
+Every statistic is held to a truth that does not use it: the exact Kalman filter on a known linear
+system (NIS and NEES have the mean that theory says, whatever is missing), quantiles with closed
+forms, numerical integration of the CRPS's definition, Gaussians whose deviation is known, and
+deleted entries. A filter with a wrong covariance is told from a right one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from oracles import random_system, spd
+from torch import Tensor
+
+from torchrl_drbpn.functional import (
+    Belief,
+    central_coverage,
+    chi_square_quantile,
+    consistency,
+    gaussian_crps,
+    gaussian_log_score,
+    gaussian_pit,
+    innovation,
+    log_score,
+    normalised_squared,
+    predict,
+    reliability_curve,
+    update,
+)
+
+BATCH, TIME, STATE, OBS = 256, 40, 3, 4
+LEVELS = torch.tensor([0.5, 0.9, 0.95], dtype=torch.float64)
+
+
+def randn(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+class Filtered:
+    """The exact filter on data of a known linear system, a fifth to all of it observed."""
+
+    def __init__(self, claimed: float = 1.0) -> None:
+        g = torch.Generator().manual_seed(3)
+        system = random_system(STATE, OBS, seed=1)
+
+        def normal(cov: Tensor) -> Tensor:
+            root = torch.linalg.cholesky(cov)
+            return torch.randn(BATCH, len(cov), generator=g, dtype=torch.float64) @ root.T
+
+        action = torch.zeros(BATCH, 2, dtype=torch.float64)
+        state = system.initial_mean + normal(system.initial_cov)
+        belief = Belief(
+            system.initial_mean.expand(BATCH, -1), system.initial_cov.expand(BATCH, -1, -1)
+        )
+        nis, nees, dof, errors, covs, masks = [], [], [], [], [], []
+        for t in range(TIME):
+            if t:
+                state = system.transition(state, action) + normal(system.transition_cov)
+                belief = predict(
+                    belief,
+                    system.transition,
+                    system.transition_cov,
+                    action,
+                    jacobian=system.dynamics,
+                )
+            # Shares of what arrives from a fifth to all, and steps with nothing.
+            share = 0.2 + 0.8 * (t % 5) / 4
+            seen = torch.rand(BATCH, OBS, generator=g) < share
+            x = state @ system.matrix.T + system.bias + normal(system.noise)
+            x = torch.where(seen, x, torch.nan)
+            given = (x, seen, system.matrix, system.noise, system.bias.expand(BATCH, -1))
+            error, cov = innovation(belief, *given)
+            nis.append(normalised_squared(error, claimed * cov, seen))
+            errors.append(error)
+            covs.append(claimed * cov)
+            masks.append(seen)
+            dof.append(seen.sum(-1))
+            belief = update(belief, *given)
+            nees.append(normalised_squared(state - belief.mean, claimed * belief.cov))
+        self.nis, self.nees, self.dof = torch.stack(nis), torch.stack(nees), torch.stack(dof)
+        self.errors, self.covs = torch.stack(errors), torch.stack(covs)
+        self.observed = torch.stack(masks)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Filtered:
+    return Filtered()
+
+
+# NIS and NEES of the exact filter ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", range(1, OBS + 1))
+def test_the_nis_of_the_exact_filter_is_chi_square_with_as_many_degrees_as_arrived(
+    exact: Filtered, count: int
+) -> None:
+    nis = exact.nis[exact.dof == count]
+    n = len(nis)
+    assert n > 500
+    # A chi-square variable has mean k and variance 2 k.
+    assert abs(nis.mean() - count) < 3.5 * math.sqrt(2 * count / n)
+    median = chi_square_quantile(0.5, count)
+    assert abs((nis < median).double().mean() - 0.5) < 3.5 * 0.5 / math.sqrt(n)
+
+
+def test_the_nees_of_the_exact_filter_has_the_dimension_of_the_state_for_its_mean(
+    exact: Filtered,
+) -> None:
+    # Rows are independent, steps are not: the standard error is that of the rows.
+    per_row = exact.nees.mean(0)
+    assert abs(per_row.mean() - STATE) < 3.5 * per_row.std() / math.sqrt(BATCH)
+    last = consistency(exact.nees[-1], torch.full((BATCH,), STATE), probability=0.999)
+    assert last.lower < last.ratio < last.upper
+
+
+def test_the_consistency_test_passes_the_exact_filter_and_fails_wrong_covariances(
+    exact: Filtered,
+) -> None:
+    ratio, lower, upper = consistency(exact.nis, exact.dof, probability=0.999)
+    assert lower < ratio < upper
+    too_sure, too_modest = Filtered(claimed=0.8), Filtered(claimed=1.25)
+    assert consistency(too_sure.nis, too_sure.dof, 0.999).ratio > upper
+    assert consistency(too_modest.nis, too_modest.dof, 0.999).ratio < lower
+
+
+def test_the_log_score_is_best_for_the_right_covariance(exact: Filtered) -> None:
+    scores = [log_score(exact.errors, c * exact.covs, exact.observed) for c in (0.7, 1.0, 1.4)]
+    assert min(scores) == scores[1]
+
+
+# Masks -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_masking_an_entry_equals_deleting_its_row(seed: int) -> None:
+    g = torch.Generator().manual_seed(seed)
+    cov, error = spd(5, g), randn(5, seed=seed)
+    seen = torch.tensor([True, False, True, True, False])
+    rows = seen.nonzero().squeeze(-1)
+    small, e = cov[rows][:, rows], error[rows]
+    hidden = torch.where(seen, error, torch.nan)
+    torch.testing.assert_close(
+        normalised_squared(hidden, cov, seen), e @ torch.linalg.solve(small, e)
+    )
+    density = torch.distributions.MultivariateNormal(torch.zeros_like(e), small).log_prob(e)
+    torch.testing.assert_close(log_score(hidden, cov, seen), -density / len(e))
+
+
+def test_missing_entries_count_in_neither_coverage_nor_reliability() -> None:
+    pit = torch.rand(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    seen = torch.rand(50, 4, generator=torch.Generator().manual_seed(1)) < 0.6
+    hidden = torch.where(seen, pit, torch.nan)
+    for curve in (central_coverage, reliability_curve):
+        torch.testing.assert_close(curve(hidden, LEVELS, seen), curve(pit[seen], LEVELS))
+        by_column = torch.stack([curve(pit[:, i][seen[:, i]], LEVELS) for i in range(4)])
+        torch.testing.assert_close(curve(hidden, LEVELS, seen, dim=0), by_column)
+        torch.testing.assert_close(curve(hidden.mT, LEVELS, seen.mT, dim=-1), by_column)
+
+
+def test_nothing_observed_is_zero_per_step_and_nan_as_an_average() -> None:
+    nothing = torch.zeros(2, 3, dtype=torch.bool)
+    squared = normalised_squared(torch.full((2, 3), torch.nan), torch.eye(3), nothing)
+    assert (squared == 0).all()
+    assert all(value.isnan() for value in consistency(squared, nothing.sum(-1)))
+    assert central_coverage(torch.full((2, 3), 0.5), LEVELS, nothing).isnan().all()
+
+
+def test_steps_with_nothing_observed_change_no_consistency_test() -> None:
+    squared, dof = torch.tensor([2.0, 0.0, 5.0]), torch.tensor([2, 0, 3])
+    with_empty, without = consistency(squared, dof), consistency(squared[::2], dof[::2])
+    assert all(a == b for a, b in zip(with_empty, without, strict=True))
+    assert with_empty.ratio == 7 / 5
+
+
+# Quantiles ---------------------------------------------------------------------------------------
+
+
+def test_chi_square_quantiles_equal_the_closed_forms_for_one_and_two_degrees() -> None:
+    p = torch.tensor([1e-6, 0.025, 0.5, 0.95, 1 - 1e-6], dtype=torch.float64)
+    torch.testing.assert_close(chi_square_quantile(p, 2), -2 * torch.log1p(-p))
+    normal = torch.special.ndtri((1 + p) / 2)
+    torch.testing.assert_close(chi_square_quantile(p, 1), normal.square(), rtol=1e-9, atol=0)
+
+
+def test_chi_square_quantiles_of_many_degrees_approach_the_normal_ones() -> None:
+    # Wilson and Hilferty: (X / k)^(1/3) is normal, mean 1 - 2 / (9 k), variance 2 / (9 k).
+    k = torch.tensor([1e3, 1e5, 1e7], dtype=torch.float64)
+    for p in (0.025, 0.975):
+        z = torch.special.ndtri(torch.tensor(p, dtype=torch.float64))
+        expected = k * (1 - 2 / (9 * k) + z * torch.sqrt(2 / (9 * k))) ** 3
+        torch.testing.assert_close(chi_square_quantile(p, k), expected, rtol=1e-5, atol=0)
+
+
+def test_a_zero_probability_has_the_quantile_zero_and_shapes_broadcast() -> None:
+    assert chi_square_quantile(0.0, 3).item() == pytest.approx(0, abs=1e-20)
+    assert chi_square_quantile(torch.tensor([[0.1], [0.9]]), torch.arange(1, 4)).shape == (2, 3)
+
+
+# Coverage, reliability ---------------------------------------------------------------------------
+
+
+def test_intervals_of_the_right_gaussians_hold_what_they_claim() -> None:
+    mean, std = randn(20_000, seed=1), randn(20_000, seed=2).abs() + 0.1
+    value = mean + std * randn(20_000, seed=3)
+    pit = gaussian_pit(value, mean, std)
+    error = torch.sqrt(LEVELS * (1 - LEVELS) / 20_000)
+    assert ((central_coverage(pit, LEVELS) - LEVELS).abs() < 3.5 * error).all()
+    assert ((reliability_curve(pit, LEVELS) - LEVELS).abs() < 3.5 * error).all()
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_coverage_of_a_wrong_deviation_is_that_of_the_intervals_it_draws(factor: float) -> None:
+    value = randn(20_000, seed=4)
+    pit = gaussian_pit(value, torch.zeros(1), torch.tensor(factor))
+    # The interval of level p has half width factor z_p; the value is standard normal.
+    half = factor * torch.special.ndtri((1 + LEVELS) / 2)
+    expected = 2 * torch.special.ndtr(half) - 1
+    assert (central_coverage(pit, LEVELS) - expected).abs().max() < 0.012
+
+
+def test_a_biased_forecast_puts_the_reliability_curve_on_one_side() -> None:
+    pit = gaussian_pit(randn(5_000) + 0.5, torch.zeros(1), torch.ones(1))
+    levels = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)
+    assert (reliability_curve(pit, levels) < levels).all()
+
+
+# Scores ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("std", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("value", [-2.5, 0.3, 4.0])
+def test_the_crps_equals_the_integral_of_its_definition(value: float, std: float) -> None:
+    mean = 0.5
+    # The integrand jumps at the value: each side by itself, trapezoids on both.
+    total = 0.0
+    for low, high, step in ((mean - 12 * std - 10, value, 0.0), (value, mean + 12 * std + 10, 1.0)):
+        y = torch.linspace(low, high, 400_001, dtype=torch.float64)
+        gap = torch.special.ndtr((y - mean) / std) - step
+        total += torch.trapezoid(gap.square(), y).item()
+    crps = gaussian_crps(*(torch.tensor(v, dtype=torch.float64) for v in (value, mean, std)))
+    assert crps.item() == pytest.approx(total, rel=1e-7)
+
+
+def test_the_crps_without_a_spread_is_the_absolute_error() -> None:
+    value, mean = randn(10, seed=1), randn(10, seed=2)
+    zero = torch.zeros(10, dtype=torch.float64)
+    torch.testing.assert_close(gaussian_crps(value, mean, zero), (value - mean).abs())
+    assert (gaussian_crps(value, value, zero) == 0).all()
+
+
+def test_both_scores_are_proper_no_other_deviation_or_mean_scores_better() -> None:
+    value = randn(50_000, seed=7)
+    for score in (gaussian_crps, gaussian_log_score):
+
+        def mean_score(mean: float, std: float, score=score) -> float:
+            return score(value, torch.tensor(mean), torch.tensor(std)).mean().item()
+
+        best = mean_score(0.0, 1.0)
+        others = [(0.0, 0.7), (0.0, 1.4), (0.3, 1.0), (-0.3, 1.0)]
+        assert all(mean_score(*other) > best for other in others)
+
+
+def test_the_log_score_of_an_entry_is_minus_its_log_density() -> None:
+    value, mean, std = randn(9, seed=1), randn(9, seed=2), randn(9, seed=3).abs() + 0.1
+    expected = -torch.distributions.Normal(mean, std).log_prob(value)
+    torch.testing.assert_close(gaussian_log_score(value, mean, std), expected)
+    seen = torch.ones(1, 9, dtype=torch.bool)
+    joint = log_score((value - mean).unsqueeze(0), torch.diag(std.square()), seen)
+    torch.testing.assert_close(joint, expected.mean())
+
+
+def test_float32_is_kept_and_gradients_flow() -> None:
+    std = torch.ones(3, requires_grad=True)
+    crps = gaussian_crps(torch.zeros(3), torch.ones(3), std)
+    assert crps.dtype == torch.float32
+    (gradient,) = torch.autograd.grad(crps.sum(), std)
+    assert gradient.isfinite().all()
+
+
+# Bad input ---------------------------------------------------------------------------------------
+
+
+def test_bad_input_is_answered_with_its_name() -> None:
+    numbers = torch.ones(2, 3)
+    with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
+        normalised_squared(numbers, torch.eye(3), numbers)
+    with pytest.raises(ValueError, match="`observed` must be bool"):
+        central_coverage(numbers, LEVELS, torch.ones(2, dtype=torch.bool))
+    with pytest.raises(ValueError, match="`observed` must be bool"):
+        log_score(numbers, torch.eye(3), torch.ones(3, dtype=torch.bool))
+    with pytest.raises(ValueError, match="`dof` must have the shape of `squared`"):
+        consistency(numbers, torch.ones(3))
+    with pytest.raises(ValueError, match=r"`probability` must lie in \(0, 1\), got 1.0"):
+        consistency(numbers, numbers, probability=1.0)
+    with pytest.raises(ValueError, match=r"`probability` must lie in \[0, 1\)"):
+        chi_square_quantile(1.0, 3)
+    with pytest.raises(ValueError, match="`dof` must be positive"):
+        chi_square_quantile(0.5, torch.tensor([1.0, 0.0]))
