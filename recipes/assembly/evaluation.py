@@ -72,6 +72,7 @@ def make_evaluation_environment(
     episodes: int,
     missingness: MissingnessSettings | None = None,
     noise: NoiseSettings | None = None,
+    complete: bool = False,
 ) -> TransformedEnv:
     """Build an environment like the training one, one simulator an episode.
 
@@ -82,6 +83,7 @@ def make_evaluation_environment(
         episodes: number of episodes.
         missingness: what does not arrive; None: as in training.
         noise: what is added; None: as in training.
+        complete: whether to write ``complete_observation`` too, for measurements alone.
 
     Returns:
         The environment. Its statistics are empty: see
@@ -97,6 +99,7 @@ def make_evaluation_environment(
         gamma=settings.loss.gamma,
         seed=settings.evaluation.seed,
         before_normalisation=belief.transforms(),
+        complete=complete,
     )
     add_primers(env, agent)
     return env

@@ -100,10 +100,10 @@ def chi_square_quantile(probability: Tensor | float, dof: Tensor | float) -> Ten
         >>> round(chi_square_quantile(0.95, 2).item(), 6)  # -2 log(1 - p)
         5.991465
     """
-    p, k = torch.broadcast_tensors(
-        torch.as_tensor(probability, dtype=torch.float64),
-        torch.as_tensor(dof, dtype=torch.float64),
-    )
+    p = torch.as_tensor(probability, dtype=torch.float64)
+    k = torch.as_tensor(dof, dtype=torch.float64)
+    shape = torch.broadcast_shapes(p.shape, k.shape)
+    p, k = p.expand(shape), k.expand(shape)
     if not bool(((p >= 0) & (p < 1)).all()):
         raise ValueError(f"`probability` must lie in [0, 1), got {probability}.")
     if not bool((k > 0).all()):
@@ -254,8 +254,8 @@ def reliability_curve(
 
     .. math:: \frac1n \sum_i [ u_i \le p ]
 
-    The diagonal if the distributions are right. An S, steep at the ends, is too sure; the other
-    way round, not sure enough; a curve on one side of the diagonal, biased.
+    The diagonal if the distributions are right. Steep at both ends: too sure. Steep in the middle:
+    not sure enough. On one side of the diagonal: biased.
 
     Args:
         pit: u, see :func:`gaussian_pit`.

@@ -2,6 +2,16 @@
 
 A builder takes the sizes of the task and its own settings, and returns a :class:`Belief`. A new
 belief module is a new file here and a new entry in conf/belief; nothing else changes.
+
+A belief that has something to say about the sensors offers it by `Belief.observing`: a module with
+the same weights that writes, beside everything else, whichever of these it has. All of it is in
+normalised units.
+
+- `ESTIMATE`: every sensor without its noise, after this step's observation, shape ``(*, obs)``
+- `ESTIMATE_VARIANCE`: how far off it may be, ``(*, obs)``
+- `FORECAST`: every sensor's reading before this step's observation, ``(*, obs)``
+- `FORECAST_COV`: its covariance, sensor noise included, ``(*, obs, obs)``
+- `NOISE_VARIANCE`: of the sensor noise that the belief assumes, ``(*, obs)``
 """
 
 from __future__ import annotations
@@ -12,10 +22,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torchrl.envs import Transform
 from torchrl.objectives import LossModule
 
 from assembly.errors import UserError
+
+ESTIMATE: NestedKey = ("belief", "observation")
+ESTIMATE_VARIANCE: NestedKey = ("belief", "observation_variance")
+FORECAST: NestedKey = ("belief", "predicted_observation")
+FORECAST_COV: NestedKey = ("belief", "innovation_cov")
+NOISE_VARIANCE: NestedKey = ("belief", "noise_variance")
 
 
 @dataclass(frozen=True)
@@ -29,6 +46,8 @@ class Belief:
         model_loss: the loss of the belief's own model, or None where it has none.
         transforms: makes further environment transforms, between missingness and normalisation.
         summary: numbers worth a column in metrics.csv, asked for once a rollout.
+        observing: makes a module with the weights of ``module`` that also writes what the belief
+            knows of the sensors (see the top of this file); None where it knows nothing.
     """
 
     module: TensorDictModuleBase
@@ -36,6 +55,7 @@ class Belief:
     model_loss: LossModule | None = None
     transforms: Callable[[], Sequence[Transform]] = tuple
     summary: Callable[[], Mapping[str, float]] = dict
+    observing: Callable[[], TensorDictModuleBase] | None = None
 
 
 def build_belief(

@@ -6,8 +6,17 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
 
-from assembly.beliefs import Belief
+from assembly.beliefs import (
+    ESTIMATE,
+    ESTIMATE_VARIANCE,
+    FORECAST,
+    FORECAST_COV,
+    NOISE_VARIANCE,
+    Belief,
+)
 from torchrl_drbpn import (
     BeliefFilter,
     BeliefFilterModule,
@@ -15,6 +24,52 @@ from torchrl_drbpn import (
     GaussianTransition,
     LinearGaussianEmission,
 )
+
+
+class SensorVariances(nn.Module):
+    """Turn the covariance of the state into variances of the sensors.
+
+    Args:
+        emission: of the filter.
+    """
+
+    def __init__(self, emission: LinearGaussianEmission) -> None:
+        super().__init__()
+        self.emission = emission
+
+    def forward(self, cov: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the diagonals of H P H' and of R.
+
+        Args:
+            cov: P, shape ``(*, state, state)``.
+
+        Returns:
+            Two tensors of shape ``(*, obs)``.
+        """
+        H = self.emission.matrix
+        variance = ((H @ cov) * H).sum(-1)
+        return variance, self.emission.cov().diagonal().expand_as(variance)
+
+
+def observing(module: BeliefFilterModule) -> TensorDictSequential:
+    """Make the filter write everything that it knows of the sensors.
+
+    Args:
+        module: the filter as the agent uses it.
+
+    Returns:
+        A module with the same weights; see :mod:`assembly.beliefs`.
+    """
+    cov = ("belief", "cov")
+    wanted = ["features", ("belief", "mean"), ("belief", "log_likelihood"), cov]
+    wanted += [ESTIMATE, FORECAST, FORECAST_COV]
+    filtering = BeliefFilterModule(module.filter, policy_input=module.policy_input, out_keys=wanted)
+    variances = TensorDictModule(
+        SensorVariances(module.filter.emission),
+        in_keys=[cov],
+        out_keys=[ESTIMATE_VARIANCE, NOISE_VARIANCE],
+    )
+    return TensorDictSequential(filtering, variances)
 
 
 def build(
@@ -64,4 +119,10 @@ def build(
         return {"emission_noise_std": std.mean().item()}
 
     covariance = state * (state + 1) // 2 if policy_input == "mean_cov" else 0
-    return Belief(module, state + covariance, BeliefModelLoss(normalize=normalize), summary=summary)
+    return Belief(
+        module,
+        state + covariance,
+        BeliefModelLoss(normalize=normalize),
+        summary=summary,
+        observing=lambda: observing(module),
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from assembly.beliefs import Belief
+from assembly.beliefs import ESTIMATE, Belief
 from torchrl_drbpn import BeliefModelLoss, ParticleFilter, ParticleFilterModule
 
 
@@ -54,4 +54,11 @@ def build(
         noise_seed=noise_seed,
     )
     module = ParticleFilterModule(particle_filter)
-    return Belief(module, module.feature_dim, BeliefModelLoss(normalize=normalize))
+    # The particles' mean; a mixture of Gaussians has no single covariance to be held to.
+    written = ["features", ("belief", "log_likelihood"), ESTIMATE]
+    return Belief(
+        module,
+        module.feature_dim,
+        BeliefModelLoss(normalize=normalize),
+        observing=lambda: ParticleFilterModule(particle_filter, out_keys=written),
+    )

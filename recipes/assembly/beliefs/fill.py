@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 
-from assembly.beliefs import Belief
+from assembly.beliefs import ESTIMATE, Belief
 from assembly.beliefs.none import ObservationFeatures
 from torchrl_drbpn import FillLastObserved
 
@@ -26,4 +27,11 @@ def build(*, obs_dim: int, action_dim: int, normalize: str, with_mask: bool) -> 
         ObservationFeatures(with_mask), in_keys=["observation", "observed"], out_keys=["features"]
     )
     width = obs_dim * (2 if with_mask else 1)
-    return Belief(module, width, transforms=lambda: [FillLastObserved()])
+    # What it holds of a missing sensor is what it was filled with.
+    filled = TensorDictModule(nn.Identity(), in_keys=["observation"], out_keys=[ESTIMATE])
+    return Belief(
+        module,
+        width,
+        transforms=lambda: [FillLastObserved()],
+        observing=lambda: TensorDictSequential(module, filled),
+    )

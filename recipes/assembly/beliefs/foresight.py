@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from assembly.beliefs import FORECAST, FORECAST_COV
 from torchrl_drbpn.functional import inverse_softplus, positive_std, zero_missing
 
 
@@ -46,7 +51,72 @@ class Foresight(nn.Module):
         """
         observed = tensordict.get("observed")
         seen = zero_missing(tensordict.get("observation"), observed)
-        mean = self.mean(torch.cat([hidden, tensordict.get("previous_action")], -1))
-        std = positive_std(self.raw_std, self.min_std)
+        mean, std = self.foresee(hidden, tensordict.get("previous_action"))
         density = torch.distributions.Normal(mean, std, validate_args=False).log_prob(seen)
         return zero_missing(density, observed).sum(-1)
+
+    def foresee(self, hidden: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of the next observation.
+
+        Args:
+            hidden: hidden state before the step, shape ``(*, hidden)``.
+            previous_action: shape ``(*, action)``.
+
+        Returns:
+            g, shape ``(*, obs)``, and sigma, shape ``(obs,)``, normalised observation units.
+        """
+        mean = self.mean(torch.cat([hidden, previous_action], -1))
+        return mean, positive_std(self.raw_std, self.min_std)
+
+
+class Foreseen(nn.Module):
+    """Say what is foreseen from a stored state, one step at a time.
+
+    Args:
+        foresight: the auxiliary task.
+        hidden_of: picks the hidden state, shape ``(*, hidden)``, out of the stored one.
+    """
+
+    def __init__(self, foresight: Foresight, hidden_of: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.foresight, self.hidden_of = foresight, hidden_of
+
+    def forward(self, state: Tensor, action: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the forecast and its covariance.
+
+        Args:
+            state: recurrent state before the step.
+            action: the one before, shape ``(*, action)``.
+            is_init: bool, shape ``(*, 1)``: an episode starts from zeros.
+
+        Returns:
+            Shapes ``(*, obs)`` and ``(*, obs, obs)``.
+        """
+        hidden = torch.where(is_init, 0.0, self.hidden_of(state))
+        mean, std = self.foresight.foresee(hidden, action)
+        return mean, torch.diag_embed(std.square().expand_as(mean))
+
+
+def foreseeing(
+    module: TensorDictModuleBase,
+    foresight: Foresight,
+    state_key: NestedKey,
+    hidden_of: Callable[[Tensor], Tensor],
+) -> TensorDictSequential:
+    """Make a recurrent belief write what it foresees, before it looks.
+
+    Args:
+        module: the belief as the agent uses it.
+        foresight: its auxiliary task.
+        state_key: where its recurrent state is read.
+        hidden_of: picks the hidden state out of that.
+
+    Returns:
+        A module with the same weights; see :mod:`assembly.beliefs`.
+    """
+    foreseen = TensorDictModule(
+        Foreseen(foresight, hidden_of),
+        in_keys=[state_key, "previous_action", "is_init"],
+        out_keys=[FORECAST, FORECAST_COV],
+    )
+    return TensorDictSequential(foreseen, module)

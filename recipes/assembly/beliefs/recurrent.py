@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.modules import GRUModule, LSTMModule
 
 from assembly.beliefs import Belief
-from assembly.beliefs.foresight import Foresight
+from assembly.beliefs.foresight import Foresight, foreseeing
 from torchrl_drbpn import BeliefModelLoss
 
 _INPUT, _STATE, _STATE_C = "recurrent_input", "recurrent_state", "recurrent_state_c"
@@ -99,11 +99,22 @@ class RecurrentBelief(TensorDictModuleBase):
 
     def _before(self, features: Tensor, stored: Tensor | None, is_init: Tensor) -> Tensor:
         """Return the hidden state before each step; zero where an episode starts."""
-        # stored: (*, layers, hidden), of which the last layer is what the features are made of
-        given = torch.zeros_like(features) if stored is None else stored[..., -1, :]
+        given = torch.zeros_like(features) if stored is None else last_layer(stored)
         if self.memory.recurrent_mode:
             given = torch.cat([given[..., :1, :], features[..., :-1, :]], -2)
         return torch.where(is_init, 0.0, given)
+
+
+def last_layer(stored: Tensor) -> Tensor:
+    """Return the hidden state that the features are made of.
+
+    Args:
+        stored: shape ``(*, layers, hidden)``.
+
+    Returns:
+        Shape ``(*, hidden)``.
+    """
+    return stored[..., -1, :]
 
 
 def build(
@@ -141,4 +152,9 @@ def build(
         init_std=init_std,
         min_std=min_std,
     )
-    return Belief(module, hidden_size, BeliefModelLoss(normalize=normalize))
+    return Belief(
+        module,
+        hidden_size,
+        BeliefModelLoss(normalize=normalize),
+        observing=lambda: foreseeing(module, module.foresight, _STATE, last_layer),
+    )

@@ -14,7 +14,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from assembly.beliefs import Belief
-from assembly.beliefs.foresight import Foresight
+from assembly.beliefs.foresight import Foresight, foreseeing
 from torchrl_drbpn import BeliefModelLoss
 
 _WINDOW: NestedKey = ("recurrent", "window")
@@ -205,4 +205,9 @@ def build(
         init_std=init_std,
         min_std=min_std,
     )
-    return Belief(module, width, BeliefModelLoss(normalize=normalize))
+    return Belief(
+        module,
+        width,
+        BeliefModelLoss(normalize=normalize),
+        observing=lambda: foreseeing(module, module.foresight, _HIDDEN, lambda hidden: hidden),
+    )

@@ -1,0 +1,169 @@
+"""Diagnose beliefs: ``python recipes/diagnose.py 'run=runs/*' out=results/<study>``.
+
+How far is what an agent believes of its sensors from what complete, noiseless ones would have
+shown, and is it as sure as it should be? The last checkpoint of each run acts; precision.csv,
+calibration.csv and reliability.csv hold a row a class of entries, the figures show them by the
+steps since a sensor was last seen.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+import torch
+from assembly.belief_figure import save_figure
+from assembly.console import run_or_explain, say
+from assembly.diagnosis import Tally, class_names, diagnose, pool
+from assembly.diagnosis_figures import (
+    Series,
+    outage_figure,
+    precision_figure,
+    reliability_figure,
+)
+from assembly.diagnosis_tables import calibration_rows, precision_rows, reliability_rows
+from assembly.errors import UserError
+from assembly.points import read_point
+from assembly.run_folder import write_table
+from assembly.settings import MissingnessSettings, check_mode
+from assembly.study import find_folders
+from assembly.study_page import csv_cells
+from assembly.trained import TrainedAgent, load_trained_agent
+from omegaconf import DictConfig, OmegaConf
+
+_FIGURES = ("precision.png", "outages.png", "reliability.png")
+
+
+def run(config: dict[str, Any]) -> int:
+    """Diagnose and write tables and figures.
+
+    Args:
+        config: see conf/diagnose.yaml.
+
+    Returns:
+        The exit status.
+    """
+    if config["run"] is None:
+        raise UserError("`run` must name run folders: run=<folder> or 'run=runs/*'.")
+    check_mode(config["mode"])
+    class_names(config["bins"])
+    if config["resamples"] < 2:
+        raise UserError(f"`resamples` must be 2 or more, got {config['resamples']}.")
+    if not config["points"]:
+        raise UserError("`points` must hold at least one, such as trained or mcar:0.5.")
+    folders = find_folders(config["run"])
+    if config["out"] is None and len(folders) > 1:
+        raise UserError("`out` must be given for several runs: out=results/<study>.")
+    out = Path(config["out"] or folders[0])
+    if out.exists() and not out.is_dir():
+        raise UserError(f"`out` must be a folder, {out} is a file.")
+    torch.set_num_threads(config["threads"])
+    options = {"resamples": config["resamples"], "seed": config["seed"]}
+    precision: list[dict[str, Any]] = []
+    calibration: list[dict[str, Any]] = []
+    reliability: list[dict[str, Any]] = []
+    series: dict[tuple[str, str, str, str], list[Tally]] = {}
+    for folder, trained, point, tally in _diagnoses(folders, config):
+        common = _common(folder, trained, point, config["mode"], tally)
+        precision += [common | row for row in precision_rows(tally, **options)]
+        calibration += [common | row for row in calibration_rows(tally, **options)]
+        reliability += [common | row for row in reliability_rows(tally)]
+        kind = (common["task"], common["point"], common["belief"], common["trained_on"])
+        series.setdefault(kind, []).append(tally)
+    out.mkdir(parents=True, exist_ok=True)
+    write_table(out / "precision.csv", csv_cells(precision))
+    for name, rows in (("calibration.csv", calibration), ("reliability.csv", reliability)):
+        if rows:
+            write_table(out / name, csv_cells(rows))
+        else:
+            (out / name).unlink(missing_ok=True)  # of an earlier diagnosis, no longer true
+    pooled = [Series(*kind, len(tallies), pool(tallies)) for kind, tallies in series.items()]
+    figures = (
+        precision_figure(pooled, **options),
+        outage_figure(pooled, **options),
+        reliability_figure(pooled),
+    )
+    for name, figure in zip(_FIGURES, figures, strict=True):
+        if figure is None:
+            (out / name).unlink(missing_ok=True)
+        else:
+            save_figure(figure, out / name, dpi=100)
+    say(f"{len(folders)} run{'s' if len(folders) > 1 else ''}, written: {out}")
+    return 0
+
+
+def _diagnoses(
+    folders: list[Path], config: dict[str, Any]
+) -> Iterator[tuple[Path, TrainedAgent, MissingnessSettings, Tally]]:
+    """Yield a tally for each run and point, and say in a line what it came to."""
+    for folder in folders:
+        trained = load_trained_agent(folder)
+        if trained.belief.observing is None:
+            name = trained.settings.belief.get("name")
+            say(
+                f"{folder.name}: belief={name} keeps no estimate of its sensors; the rows are "
+                "those of the last value and the running mean"
+            )
+        read = [read_point(str(p), trained.settings.missingness) for p in config["points"]]
+        for point in dict.fromkeys(read):
+            tally = diagnose(
+                trained,
+                point,
+                episodes=config["episodes"],
+                mode=config["mode"],
+                seed=config["seed"],
+                bins=config["bins"],
+            )
+            say(_summary(folder, point, tally))
+            yield folder, trained, point, tally
+
+
+def _summary(folder: Path, point: MissingnessSettings, tally: Tally) -> str:
+    """Return a line: the error of each estimate where sensors are missing, NIS over entries."""
+    parts = [f"{folder.name}, {_text(point)}, missing {tally.missing_ratio:.3f}"]
+    for row in precision_rows(tally, resamples=2, seed=0):
+        if row["entries"] == "missing" and row["steps_since_seen"] == "all":
+            parts.append(f"{row['estimate']} {row['rmse']:.3f}")
+    for row in calibration_rows(tally, resamples=2, seed=0):
+        if row["held_against"] == "reading" and row["steps_since_seen"] == "all":
+            parts.append(f"NIS/entries {row['nis_per_dof']:.2f}")
+    return "; ".join([parts[0], "RMSE of missing sensors", *parts[1:]])
+
+
+def _common(
+    folder: Path, trained: TrainedAgent, point: MissingnessSettings, mode: str, tally: Tally
+) -> dict[str, Any]:
+    """Return the columns that all rows of a run at a point have."""
+    settings = trained.settings
+    return {
+        "run": folder.name,
+        "task": settings.env.env_id,
+        "belief": str(settings.belief.get("name", "")),
+        "training_seed": settings.seed,
+        "trained_on": _text(settings.missingness),
+        "point": _text(point),
+        "missing_ratio": tally.missing_ratio,
+        "mode": mode,
+        "episodes": len(tally.lengths),
+    }
+
+
+def _text(missingness: MissingnessSettings) -> str:
+    """Return a point as it is written on the command line."""
+    return f"{missingness.mechanism}:{missingness.eta:g}"
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="diagnose")
+def main(config: DictConfig) -> None:
+    """Start from the command line."""
+    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    status = run_or_explain(lambda: run(plain))
+    if status:
+        sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()
