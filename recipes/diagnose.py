@@ -29,8 +29,8 @@ from assembly.errors import UserError
 from assembly.points import read_point
 from assembly.run_folder import write_table
 from assembly.settings import MissingnessSettings, check_mode
-from assembly.study import find_folders
-from assembly.study_page import csv_cells
+from assembly.report_runs import find_folders
+from assembly.report_page import csv_cells
 from assembly.trained import TrainedAgent, load_trained_agent
 from omegaconf import DictConfig, OmegaConf
 

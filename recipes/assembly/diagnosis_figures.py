@@ -58,7 +58,7 @@ class Series:
 _Draw = Callable[[Any, Series, str], None]
 
 
-def precision_figure(series: Sequence[Series], *, resamples: int, seed: int) -> Figure:
+def precision_figure(series: Sequence[Series], *, resamples: int, seed: int) -> Figure | None:
     """Draw the error of every estimate over the steps since a sensor was last seen.
 
     Args:
@@ -67,7 +67,7 @@ def precision_figure(series: Sequence[Series], *, resamples: int, seed: int) -> 
         seed: of them.
 
     Returns:
-        The figure, one column a task and one row a point.
+        The figure, one column a task and one row a point; None without series.
     """
 
     def draw(axis: Any, one: Series, colour: str) -> None:
@@ -85,9 +85,7 @@ def precision_figure(series: Sequence[Series], *, resamples: int, seed: int) -> 
                 _curve(axis, ["0", *one.tally.classes], points, style, width, colour, label)
         axis.set_yscale("log")
 
-    return _grid(
-        series, draw, across="steps since last seen", up="RMSE to the noiseless truth, normalised"
-    )
+    return _grid(series, draw, across="steps since last seen", up="RMSE, normalised units")
 
 
 def outage_figure(series: Sequence[Series], *, resamples: int, seed: int) -> Figure | None:
@@ -108,10 +106,13 @@ def outage_figure(series: Sequence[Series], *, resamples: int, seed: int) -> Fig
         axis.axhline(1.0, color="#444444", lw=0.8)
         axis.set_yscale("log")
 
-    known = [s for s in series if _OF_READINGS in s.tally.honesty]
-    if not known:
-        return None
-    return _grid(known, draw, across="steps since last seen, when it arrives", up="NIS / entries")
+    return _grid(
+        series,
+        draw,
+        lambda one: _OF_READINGS in one.tally.honesty,
+        across="steps since last seen, when it arrives",
+        up="NIS / entries",
+    )
 
 
 def reliability_figure(series: Sequence[Series]) -> Figure | None:
@@ -139,18 +140,32 @@ def reliability_figure(series: Sequence[Series]) -> Figure | None:
         axis.set_xlim(0, 1)
         axis.set_ylim(0, 1)
 
-    known = [s for s in series if s.tally.reliability]
-    if not known:
-        return None
-    return _grid(known, draw, across="quantile", up="share of values under it")
+    return _grid(
+        series,
+        draw,
+        lambda one: bool(one.tally.reliability),
+        across="quantile",
+        up="share of values under it",
+    )
 
 
-def _grid(series: Sequence[Series], draw: _Draw, *, across: str, up: str) -> Figure:
-    """Draw a panel for each task and point."""
-    tasks = list(dict.fromkeys(s.task for s in series))
-    points = list(dict.fromkeys(s.point for s in series))
+def _grid(
+    series: Sequence[Series],
+    draw: _Draw,
+    has: Callable[[Series], bool] = lambda _: True,
+    *,
+    across: str,
+    up: str,
+) -> Figure | None:
+    """Draw a panel for each task and point with series that have something to draw."""
+    # A belief has one colour in every figure of a diagnosis.
     kinds = list(dict.fromkeys((s.belief, s.trained_on) for s in series))
     colours = {kind: _COLOURS[i % len(_COLOURS)] for i, kind in enumerate(kinds)}
+    shown = [s for s in series if has(s)]
+    if not shown:
+        return None
+    tasks = list(dict.fromkeys(s.task for s in shown))
+    points = list(dict.fromkeys(s.point for s in shown))
     handles: dict[str, Any] = {}
     with mpl.rc_context(STYLE):
         size = (_PANEL[0] * len(tasks), _PANEL[1] * len(points))
@@ -159,7 +174,7 @@ def _grid(series: Sequence[Series], draw: _Draw, *, across: str, up: str) -> Fig
         for row, point in enumerate(points):
             for column, task in enumerate(tasks):
                 axis = axes[row][column]
-                own = [s for s in series if (s.task, s.point) == (task, point)]
+                own = [s for s in shown if (s.task, s.point) == (task, point)]
                 if not own:
                     axis.axis("off")
                     continue
@@ -172,6 +187,7 @@ def _grid(series: Sequence[Series], draw: _Draw, *, across: str, up: str) -> Fig
                     f"{runs} run{'s' if runs > 1 else ''}"
                 )
                 if axis.get_yscale() == "log":
+                    axis.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
                     axis.yaxis.set_major_formatter("{x:g}")
                     axis.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
                 handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
