@@ -27,10 +27,10 @@ from assembly.diagnosis_figures import (
 from assembly.diagnosis_tables import calibration_rows, precision_rows, reliability_rows
 from assembly.errors import UserError
 from assembly.points import read_point
+from assembly.report_page import csv_cells
+from assembly.report_runs import find_folders
 from assembly.run_folder import write_table
 from assembly.settings import MissingnessSettings, check_mode
-from assembly.report_runs import find_folders
-from assembly.report_page import csv_cells
 from assembly.trained import TrainedAgent, load_trained_agent
 from omegaconf import DictConfig, OmegaConf
 

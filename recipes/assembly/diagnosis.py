@@ -175,8 +175,10 @@ def diagnose(
             tally.lengths += running
             tally.observed += observed.sum(-1) * running
             seen, since = seen | observed, torch.where(observed, 0, since + 1)
-            stepped, data = env.step_and_maybe_reset(data)
+            # An episode that is over costs no simulation.
+            stepped = env.step(data.set("_step", running.unsqueeze(-1)))
             running = running & ~stepped.get(("next", "done")).squeeze(-1)
+            data = env.step_mdp(stepped)
             if len(held) == chunk or not running.any():
                 steps = {key: torch.stack([row[key] for row in held], 1) for key in held[0]}
                 _add(tally, steps)

@@ -102,7 +102,7 @@ def chi_square_quantile(probability: Tensor | float, dof: Tensor | float) -> Ten
     """
     p = torch.as_tensor(probability, dtype=torch.float64)
     k = torch.as_tensor(dof, dtype=torch.float64)
-    shape = torch.broadcast_shapes(p.shape, k.shape)
+    shape = (p + k).shape
     p, k = p.expand(shape), k.expand(shape)
     if not bool(((p >= 0) & (p < 1)).all()):
         raise ValueError(f"`probability` must lie in [0, 1), got {probability}.")

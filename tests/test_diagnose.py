@@ -1,0 +1,447 @@
+"""The diagnosis of beliefs.
+
+What is counted is what was the case: on data with known errors the tables hold them, sorted by the
+steps since a sensor was last seen as a plain loop over the mask counts them; a belief that is right
+has a NIS of one and covers what it claims, a wrong one is told. Whatever has an estimate of its
+sensors is asked for it by the same names, and what it writes is what it acts on. The command leaves
+tables and figures whole, the same bytes for the same seed, and answers bad input in one line.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
+from recipe_tools import make_config  # isort: skip
+
+import diagnose
+from assembly import diagnosis
+from assembly.beliefs import ESTIMATE, FORECAST, FORECAST_COV
+from assembly.checkpoint import save_checkpoint
+from assembly.diagnosis import Forecast, Tally, class_names, pool
+from assembly.diagnosis_tables import (
+    Resampling,
+    calibration_rows,
+    precision_rows,
+    reliability_rows,
+)
+from assembly.environment import copy_statistics
+from assembly.errors import UserError
+from assembly.evaluation import make_evaluation_environment
+from assembly.run_folder import write_config
+from assembly.settings import read_settings
+from assembly.trained import TrainedAgent, load_trained_agent
+from assembly.training import assemble, train_rollout, training_state
+from matplotlib.image import imread
+
+SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
+BINS = [1, 2, 3, 6]
+BELIEFS = ("drbpn", "gru", "gru_action", "fill", "none", "dvrl", "transformer")
+READINGS = Forecast("predicted", True, "reading", "arrived")
+DEFAULTS: dict[str, Any] = {
+    "points": ["trained"],
+    "episodes": 2,
+    "mode": "sampled",
+    "seed": 4,
+    "bins": BINS,
+    "resamples": 20,
+    "threads": 1,
+}
+
+
+@pytest.fixture(autouse=True)
+def _global_state() -> Iterator[None]:
+    """Recipes set the global generator and the number of threads; give them back."""
+    threads = torch.get_num_threads()
+    with torch.random.fork_rng(devices=[]):
+        yield
+    torch.set_num_threads(threads)
+
+
+def make_folder(folder: Path, *overrides: str) -> Path:
+    """Leave a run folder with a checkpoint after one rollout."""
+    config = make_config(*SMOKE, *overrides)
+    folder.mkdir()
+    with torch.random.fork_rng(devices=[]):
+        settings = read_settings(config)
+        training = assemble(settings)
+        train_rollout(training, settings)
+        save_checkpoint(folder, training.progress.frames, training_state(training), keep=1)
+    write_config(folder, config)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("runs")
+    return {name: make_folder(root / name, f"belief={name}") for name in BELIEFS}
+
+
+@pytest.fixture(scope="module")
+def agents(folders: dict[str, Path]) -> dict[str, TrainedAgent]:
+    return {name: load_trained_agent(folder) for name, folder in folders.items()}
+
+
+def tally_of(trained: TrainedAgent, **changes: Any) -> Tally:
+    options: dict[str, Any] = {"episodes": 3, "mode": "sampled", "seed": 4, "bins": BINS}
+    return diagnosis.diagnose(trained, trained.settings.missingness, **(options | changes))
+
+
+# What is counted -----------------------------------------------------------------------------
+
+
+def steps_with(observed: torch.Tensor, **more: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Steps (episodes, time, obs) of zeros beside a mask, classes by a plain loop."""
+    episodes, time, obs = observed.shape
+    classes = torch.zeros(observed.shape, dtype=torch.int64)
+    for e, i in itertools.product(range(episodes), range(obs)):
+        seen = observed[e, :, i].tolist()
+        latest: int | None = None
+        for t in range(time):
+            if latest is None:
+                classes[e, t, i] = len(BINS)
+            else:
+                classes[e, t, i] = max(k for k, b in enumerate(BINS) if b <= t - latest)
+            latest = t if seen[t] else latest
+    zeros = torch.zeros(observed.shape, dtype=torch.float64)
+    names = ("reading", "truth", "last value", "running mean")
+    return {
+        "observed": observed,
+        "running": torch.ones_like(observed),
+        "class": classes,
+        **dict.fromkeys(names, zeros),
+        **more,
+    }
+
+
+def test_steps_since_last_seen_are_those_a_plain_loop_counts(
+    agents: dict[str, TrainedAgent], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[dict[str, torch.Tensor]] = []
+    add = diagnosis._add
+
+    def keep(tally: Tally, steps: dict[str, torch.Tensor]) -> None:
+        held.append({k: v.clone() for k, v in steps.items()})
+        add(tally, steps)
+
+    monkeypatch.setattr(diagnosis, "_add", keep)
+    tally = tally_of(agents["drbpn"])
+    steps = {key: torch.cat([h[key] for h in held], 1) for key in held[0]}
+    assert len(held) > 0
+    expected = steps_with(steps["observed"])["class"]
+    running = steps["running"]
+    assert torch.equal(steps["class"][running], expected[running])
+    # The last value is that of the latest step at which the sensor was seen.
+    readings, last = steps["reading"], torch.zeros_like(steps["reading"][:, 0])
+    for t in range(readings.shape[1]):
+        last = torch.where(steps["observed"][:, t], readings[:, t], last)
+        assert torch.equal(steps["last value"][:, t], last)
+    assert torch.equal(running[:, :, 0].sum(1).double(), tally.lengths.double())
+    counts = tally.precision["filtered", "missing"]["count"]
+    assert counts.sum() == (~steps["observed"] & running).sum()
+    assert tally.missing_ratio == pytest.approx(0.4, abs=0.12)
+
+
+def test_errors_are_sorted_by_arrival_and_by_steps_since_last_seen() -> None:
+    observed = torch.tensor([1, 0, 0, 0, 1, 0], dtype=torch.bool).reshape(1, 6, 1)
+    error = torch.tensor([9, 1, 2, 3, 8, 5], dtype=torch.float64).reshape(1, 6, 1)
+    tally = Tally(class_names(BINS), torch.tensor([6.0]), torch.tensor([2.0]), 1)
+    diagnosis._add(tally, steps_with(observed, filtered=error))
+    rows = {
+        (row["estimate"], row["entries"], row["steps_since_seen"]): row
+        for row in precision_rows(tally, resamples=2, seed=0)
+    }
+    missing = {k[2]: v["rmse"] for k, v in rows.items() if k[:2] == ("filtered", "missing")}
+    assert missing == pytest.approx(
+        {"1": math.sqrt((1 + 25) / 2), "2": 2, "3-5": 3, "all": math.sqrt(39 / 4)}
+    )
+    assert rows["filtered", "arrived", "0"]["rmse"] == pytest.approx(math.sqrt((81 + 64) / 2))
+    assert rows["running mean", "missing", "all"]["rmse"] == 0
+
+
+def known_forecasts(std: float) -> Tally:
+    """Readings around forecasts with a deviation of 1, where `std` is claimed."""
+    g = torch.Generator().manual_seed(0)
+    shape = (40, 100, 3)
+    observed = torch.rand(shape, generator=g) < 0.6
+    root = torch.tensor([[1.0, 0, 0], [0.6, 0.8, 0], [0, 0.6, 0.8]], dtype=torch.float64)
+    reading = torch.randn(shape, generator=g, dtype=torch.float64) @ root.T
+    cov = std**2 * (root @ root.T).expand(*shape[:2], 3, 3)
+    steps = steps_with(observed) | {
+        "reading": torch.where(observed, reading, torch.nan),
+        "truth": reading,
+        "predicted": torch.zeros(shape, dtype=torch.float64),
+        "predicted cov": cov,
+        "filtered": torch.zeros(shape, dtype=torch.float64),
+        "filtered variance": cov.diagonal(dim1=-2, dim2=-1),
+    }
+    total = observed.sum((1, 2)).double()
+    tally = Tally(class_names(BINS), torch.full((40,), 100.0), total, 3)
+    for start in range(0, 100, 30):  # chunks of different length
+        diagnosis._add(tally, {k: v[:, start : start + 30] for k, v in steps.items()})
+    return tally
+
+
+def test_a_right_belief_is_found_consistent_and_covers_what_it_claims() -> None:
+    tally = known_forecasts(1.0)
+    rows = list(calibration_rows(tally, resamples=200, seed=0))
+    for row in rows:
+        if row["count"] < 500:
+            continue
+        assert row["coverage_90"] == pytest.approx(0.9, abs=0.04)
+        assert row["coverage_50"] == pytest.approx(0.5, abs=0.07)
+        # The CRPS of a right standard normal forecast is 1 / sqrt(pi).
+        assert row["crps"] == pytest.approx(1 / math.sqrt(math.pi), abs=0.05)
+        if row["held_against"] == "reading":
+            assert row["nis_per_dof"] == pytest.approx(1, abs=0.15)
+            assert row["consistent_low"] < 1 < row["consistent_high"]
+    (together,) = [
+        r for r in rows if r["held_against"] == "reading" and r["steps_since_seen"] == "all"
+    ]
+    assert together["nis_per_dof_low"] < 1 < together["nis_per_dof_high"]
+    (curve,) = [r for r in reliability_rows(tally) if r["held_against"] == "reading"]
+    assert all(curve[f"under_{p}"] == pytest.approx(p / 100, abs=0.02) for p in (5, 50, 95))
+
+
+def test_a_belief_that_is_too_sure_is_told_by_every_statistic() -> None:
+    right, sure = known_forecasts(1.0), known_forecasts(0.5)
+    first, second = (
+        {tuple(r.values())[:5]: r for r in calibration_rows(t, resamples=20, seed=0)}
+        for t in (right, sure)
+    )
+    key = ("predicted", "in", "reading", "arrived", "all")
+    assert second[key]["nis_per_dof"] == pytest.approx(4 * first[key]["nis_per_dof"])
+    assert second[key]["nis_per_dof"] > second[key]["consistent_high"]
+    # A central 95 % interval of half the width holds 2 Phi(1.96 / 2) - 1 = .673.
+    assert second[key]["coverage_95"] == pytest.approx(0.673, abs=0.03)
+    assert second[key]["crps"] > first[key]["crps"]
+    assert second[key]["log_score"] > first[key]["log_score"]
+
+
+def test_nis_by_class_are_those_of_the_rows_of_a_class_alone() -> None:
+    observed = torch.ones(1, 2, 2, dtype=torch.bool)
+    observed[0, 0, 1] = False  # at step 1 one sensor was seen the step before, one never
+    cov = torch.tensor([[2.0, 1.0], [1.0, 2.0]], dtype=torch.float64).expand(1, 2, 2, 2)
+    reading = torch.tensor([[[0.0, 0.0], [2.0, 4.0]]], dtype=torch.float64)
+    tally = Tally(class_names(BINS), torch.tensor([2.0]), torch.tensor([3.0]), 2)
+    zeros = torch.zeros_like(reading)
+    more = {"reading": reading, "predicted": zeros, "predicted cov": cov}
+    diagnosis._add(tally, steps_with(observed) | more)
+    sums = tally.honesty[READINGS]
+    assert sums["nis"][0].tolist() == pytest.approx([4 / 2, 0, 0, 0, 16 / 2])
+    # Together: (2, 4) C^-1 (2, 4)' with C^-1 = [[2, -1], [-1, 2]] / 3.
+    assert sums["nis_joint"].item() == pytest.approx((2 * 4 + 2 * 16 - 2 * 8) / 3)
+
+
+def test_pooled_tallies_count_the_entries_of_both(agents: dict[str, TrainedAgent]) -> None:
+    first, second = tally_of(agents["drbpn"]), tally_of(agents["drbpn"], seed=5)
+    both = pool([first, second])
+    assert len(both.lengths) == 6
+    for forecast, sums in both.honesty.items():
+        parts = (first.honesty[forecast]["crps"].sum(), second.honesty[forecast]["crps"].sum())
+        assert sums["crps"].sum() == pytest.approx(sum(parts).item())
+
+
+# Intervals -------------------------------------------------------------------------------------
+
+
+def test_an_interval_over_episodes_is_that_of_a_mean_over_independent_episodes() -> None:
+    values = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ones = torch.ones(400, dtype=torch.float64)
+    mean, low, high = Resampling(400, 4000, seed=1).ratio(values, ones)
+    half = 1.96 * values.std().item() / 20
+    assert mean == pytest.approx(values.mean().item())
+    assert (low, high) == pytest.approx((mean - half, mean + half), abs=0.15 * half)
+
+
+def test_nothing_to_count_is_an_empty_cell_and_one_episode_has_no_interval() -> None:
+    resampling = Resampling(3, 50, seed=0)
+    assert resampling.ratio(torch.zeros(3), torch.zeros(3)) == (None, None, None)
+    one = torch.tensor([0.0, 4.0, 0.0], dtype=torch.float64)
+    assert resampling.ratio(2 * one, one) == (2.0, None, None)
+
+
+# What beliefs offer ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BELIEFS)
+def test_an_observing_belief_acts_as_the_trained_one(
+    agents: dict[str, TrainedAgent], name: str
+) -> None:
+    trained = agents[name]
+    make = trained.belief.observing
+    if make is None:
+        assert name == "none"
+        return
+    env = make_evaluation_environment(trained.settings, trained.belief, trained.agent, episodes=2)
+    copy_statistics(trained.statistics, env)
+    observing = make()
+    with torch.no_grad():
+        data = env.reset()
+        for _ in range(4):
+            plain, seeing = trained.agent.belief(data.clone()), observing(data.clone())
+            for key in trained.agent.belief.out_keys:
+                torch.testing.assert_close(seeing[key], plain[key])
+            data = env.step_mdp(env.step(trained.agent.actor(plain)))
+    env.close()
+    ids = {id(p) for p in trained.agent.belief.parameters()}
+    assert {id(p) for p in observing.parameters()} <= ids  # not a copy that would grow stale
+
+
+@pytest.mark.parametrize("name", ["drbpn", "gru", "gru_action", "transformer"])
+def test_a_forecast_gives_what_arrived_the_likelihood_that_the_belief_reports(
+    agents: dict[str, TrainedAgent], name: str
+) -> None:
+    trained = agents[name]
+    assert trained.belief.observing is not None
+    observing = trained.belief.observing()
+    env = make_evaluation_environment(trained.settings, trained.belief, trained.agent, episodes=2)
+    copy_statistics(trained.statistics, env)
+    with torch.no_grad():
+        data = env.reset()
+        for _ in range(4):
+            data = observing(data)
+            for row in range(2):
+                seen = data["observed"][row]
+                if seen.any():
+                    mean = data[FORECAST][row][seen].double()
+                    cov = data[FORECAST_COV][row][seen][:, seen].double()
+                    density = torch.distributions.MultivariateNormal(mean, cov).log_prob(
+                        data["observation"][row][seen].double()
+                    )
+                    reported = data["belief", "log_likelihood"][row].double()
+                    torch.testing.assert_close(reported, density, rtol=1e-4, atol=1e-4)
+            data = env.step_mdp(env.step(trained.agent.actor(data)))
+    env.close()
+
+
+def test_each_kind_of_belief_has_the_rows_of_what_it_knows(
+    agents: dict[str, TrainedAgent],
+) -> None:
+    known = {name: tally_of(agents[name], episodes=2) for name in BELIEFS}
+    estimates = {name: {e for e, _ in tally.precision} for name, tally in known.items()}
+    references = {"last value", "running mean"}
+    assert estimates["drbpn"] == references | {"filtered", "predicted"}
+    assert estimates["fill"] == estimates["dvrl"] == references | {"filtered"}
+    for name in ("gru", "gru_action", "transformer"):
+        assert estimates[name] == references | {"predicted"}
+    assert estimates["none"] == references
+    honest = {name for name, tally in known.items() if tally.honesty}
+    assert honest == {"drbpn", "gru", "gru_action", "transformer"}
+
+
+def test_the_filled_value_is_the_last_value_once_a_sensor_was_seen(
+    agents: dict[str, TrainedAgent],
+) -> None:
+    tally = tally_of(agents["fill"])
+    filled = tally.precision["filtered", "missing"]["squared"][:, :-1]
+    last = tally.precision["last value", "missing"]["squared"][:, :-1]
+    torch.testing.assert_close(filled, last, rtol=1e-4, atol=1e-6)
+
+
+def test_the_truth_is_before_the_noise_and_readings_are_after_it(
+    agents: dict[str, TrainedAgent],
+) -> None:
+    # A last value that has just arrived is off by the sensor noise alone.
+    trained = agents["none"]
+    noise = trained.settings.noise.scale * trained.settings.noise.sigma
+    sums = tally_of(trained).precision["last value", "arrived"]
+    rmse = (sums["squared"].sum() / sums["count"].sum()).sqrt().item()
+    assert noise > 0
+    assert ESTIMATE  # named for everybody
+    (norm,) = [t for t in trained.statistics.transform if hasattr(t, "denormalize")]
+    expected = (noise / norm.scale).square().mean().sqrt().item()
+    assert rmse == pytest.approx(expected, rel=0.5)
+
+
+# The command -----------------------------------------------------------------------------------
+
+
+def run(folders: Any, out: Path | None, **changes: Any) -> int:
+    return diagnose.run({"run": folders, "out": out, **DEFAULTS, **changes})
+
+
+def test_the_command_leaves_tables_and_figures_and_says_who_has_no_estimate(
+    folders: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = [str(folders[name]) for name in ("drbpn", "gru", "none")]
+    points = ["trained", "mcar:0.4", "none:0"]  # the first two are the same
+    assert run(chosen, tmp_path / "study", points=points) == 0
+    left = sorted(path.name for path in (tmp_path / "study").iterdir())
+    assert left == sorted(
+        ["precision.csv", "calibration.csv", "reliability.csv", *diagnose._FIGURES]
+    )
+    said = capsys.readouterr().out
+    assert said.count("none: belief=none keeps no estimate") == 1
+    with (tmp_path / "study" / "precision.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(r["belief"], r["point"]) for r in rows} == {
+        (name, point) for name in ("drbpn", "gru", "none") for point in ("mcar:0.4", "none:0")
+    }
+    assert all(r["entries"] == "arrived" for r in rows if r["point"] == "none:0")
+    assert all(float(r["rmse_low"]) <= float(r["rmse_high"]) for r in rows if r["rmse_low"])
+    with (tmp_path / "study" / "calibration.csv").open(newline="") as file:
+        assert {r["belief"] for r in csv.DictReader(file)} == {"drbpn", "gru"}
+    for name in diagnose._FIGURES:
+        pixels = imread(tmp_path / "study" / name)[..., :3]
+        assert 0.01 < (pixels.min(-1) < 0.9).mean() < 0.9
+
+
+def test_the_same_seed_gives_the_same_bytes_beside_the_run_where_no_folder_is_named(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    assert run(str(folders["drbpn"]), None) == 0
+    assert run(str(folders["drbpn"]), tmp_path) == 0
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (folders["drbpn"] / path.name).read_bytes(), path.name
+
+
+def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    assert run(str(folders["gru"]), tmp_path) == 0
+    assert run(str(folders["fill"]), tmp_path) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["precision.csv", "precision.png"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"run": None}, "`run` must name run folders"),
+        ({"run": "nowhere"}, "`nowhere` must be a run folder"),
+        ({"points": []}, "`points` must hold at least one"),
+        ({"points": ["mcar:2"]}, "`points` must hold"),
+        ({"mode": "best"}, "`modes` must hold"),
+        ({"episodes": 0}, "`episodes` must be positive"),
+        ({"bins": [2, 3]}, "`bins` must be whole numbers that start at 1"),
+        ({"bins": [1, 3, 3]}, "`bins` must be whole numbers that start at 1 and ascend"),
+        ({"resamples": 1}, "`resamples` must be 2 or more"),
+    ],
+)
+def test_bad_input_is_answered_with_one_line(
+    folders: dict[str, Path], tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    config = {"run": str(folders["drbpn"]), "out": tmp_path / "study", **DEFAULTS, **changes}
+    with pytest.raises(UserError, match=message) as caught:
+        diagnose.run(config)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "study").exists()
+
+
+def test_several_runs_need_a_folder_and_a_file_is_none(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match="`out` must be given for several runs"):
+        run([str(folders["gru"]), str(folders["none"])], None)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="`out` must be a folder"):
+        run(str(folders["gru"]), tmp_path / "file")
