@@ -36,6 +36,7 @@ def training_command(run: StudyRun) -> str:
     groups = [f"env={s.env.name}"]
     choices = {
         "belief": str(s.belief.get("name", "")),
+        "algo": str(s.algo.get("name", "")),
         "missingness": s.missingness.mechanism,
         "noise": "gaussian" if s.noise.sigma > 0 else "none",
     }
@@ -43,6 +44,7 @@ def training_command(run: StudyRun) -> str:
         defaults = composed_config([])
         chosen = {
             "belief": defaults["belief"].get("name"),
+            "algo": defaults["algo"].get("name"),
             "missingness": defaults["missingness"]["mechanism"],
             "noise": "gaussian" if defaults["noise"]["sigma"] > 0 else "none",
         }

@@ -229,8 +229,14 @@ def _read_run(folder: Path, name: str) -> StudyRun:
         _read_csv(path, {"frames", "return"}) if path.is_file() else [],
         _evaluations(folder, settings),
         study,
-        method or str(settings.belief.get("name", "")),
+        method or _method(settings),
     )
+
+
+def _method(settings: Settings) -> str:
+    """Name a run that is no cell of a study: its belief, and its algorithm where it is not PPO."""
+    belief, algo = str(settings.belief.get("name", "")), str(settings.algo.get("name", ""))
+    return belief if algo == "ppo" else f"{belief} ({algo})"
 
 
 def _cell(folder: Path) -> tuple[str | None, str | None]:

@@ -32,6 +32,9 @@ class ACKTR:
         desired_kl: divergence of the policy over one rollout, nats.
         policy: arguments of :class:`~assembly.algorithms.kfac.KFAC`.
         critic: the same, and ``steps`` a rollout.
+
+    Raises:
+        ValueError: if a number makes no sense.
     """
 
     def __init__(
@@ -46,6 +49,11 @@ class ACKTR:
         self.agent, self.desired_kl = agent, desired_kl
         own = dict(critic)
         self.critic_steps = int(own.pop("steps"))
+        if not desired_kl > 0 or self.critic_steps < 1:
+            raise ValueError(
+                f"`desired_kl` must be positive and `critic.steps` 1 or more, "
+                f"got {desired_kl} and {self.critic_steps}."
+            )
         scales = [m for m in agent.actor.modules() if isinstance(m, AddStateIndependentNormalScale)]
         # The scale is the exp of its parameter: 2 nats a component, whatever the state.
         fisher = {scale.state_independent_scale: 2.0 for scale in scales}

@@ -83,7 +83,8 @@ class KFAC(torch.optim.Optimizer):
             components, which depends on nothing: 2 for the log of a standard deviation.
 
     Raises:
-        ValueError: if a parameter of the module belongs to no such layer.
+        ValueError: if a number makes no sense, or a parameter of the module belongs to no such
+            layer.
 
     Example:
         >>> _ = torch.manual_seed(0)
@@ -110,6 +111,12 @@ class KFAC(torch.optim.Optimizer):
         max_kl: float,
         constant_fisher: Mapping[nn.Parameter, float] | None = None,
     ) -> None:
+        for name, value in {"lr": lr, "damping": damping, "max_kl": max_kl}.items():
+            if not value > 0:
+                raise ValueError(f"`{name}` must be positive, got {value}.")
+        for name, value in {"momentum": momentum, "decay": decay}.items():
+            if not 0 <= value < 1:
+                raise ValueError(f"`{name}` must lie in [0, 1), got {value}.")
         self._layers = [m for m in module.modules() if isinstance(m, nn.Linear)]
         constant = dict(constant_fisher or {})
         groups: list[dict[str, Any]] = [
@@ -160,8 +167,8 @@ class KFAC(torch.optim.Optimizer):
         for layer, (inputs, _), g in zip(self._layers, self._recorded, scores, strict=True):
             factors = kronecker_factors(inputs.flatten(0, -2), g.flatten(0, -2))
             state = self.state[layer.weight]
-            if not state:
-                state["observations"] = torch.zeros(())
+            if "observations" not in state:
+                state["observations"] = 0  # not a tensor: loading would give it the layer's dtype
                 state["a"], state["g"] = map(torch.zeros_like, factors)
             state["observations"] += 1
             for key, factor in zip(("a", "g"), factors, strict=True):
@@ -177,6 +184,9 @@ class KFAC(torch.optim.Optimizer):
 
         Returns:
             The divergence that the quadratic model predicts for ``lr s u``, nats.
+
+        Raises:
+            RuntimeError: before the first :meth:`observe`.
         """
         del closure
         moves, product = [], torch.zeros(())
@@ -204,6 +214,8 @@ class KFAC(torch.optim.Optimizer):
         if group["fisher"] is not None:
             return gradient / (group["fisher"] + self.damping)
         state = self.state[group["params"][0]]
+        if "observations" not in state:
+            raise RuntimeError("`step` needs a curvature: call `observe` first.")
         # The averages began at 0, as Adam's do.
         weight = 1 - self.decay ** state["observations"]
         return solve_kronecker(gradient, state["a"] / weight, state["g"] / weight, self.damping)

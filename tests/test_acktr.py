@@ -1,0 +1,187 @@
+"""ACKTR behind the recipe's one path (`algo=acktr`).
+
+A rollout is learned from by natural-gradient steps: the value comes nearer to its targets, the
+divergence of the policy is steered to the one asked for. A stopped run goes on to the last bit. A
+belief that has weights of its own is refused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+pytest.importorskip("hydra")
+from recipe_tools import differences, make_config, read_table  # isort: skip
+
+from assembly.algorithms import build_algorithm
+from assembly.algorithms.acktr import ACKTR
+from assembly.checkpoint import last_checkpoint, load_checkpoint
+from assembly.errors import UserError
+from assembly.report_commands import training_command
+from assembly.report_runs import read_study
+from assembly.resume import resumed_config
+from assembly.rollout import add_advantages
+from assembly.run import run
+from assembly.settings import read_settings
+from assembly.training import Training, assemble, make_agent, train_rollout
+
+SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.steps=3")
+
+
+@pytest.fixture(autouse=True)
+def _global_state() -> Iterator[None]:
+    """Recipes set the global generator and the number of threads; give them back."""
+    threads = torch.get_num_threads()
+    with torch.random.fork_rng(devices=[]):
+        yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run the smoke experiment once, to its end."""
+    folder = tmp_path_factory.mktemp("run") / "smoke"
+    with torch.random.fork_rng(devices=[]):
+        assert run(make_config(*SMOKE), folder) == 0
+    return folder
+
+
+def rollout_of(*overrides: str) -> tuple[Training, TensorDictBase]:
+    """A freshly assembled training and its first rollout, with advantages."""
+    training = assemble(read_settings(make_config(*SMOKE, *overrides)))
+    assert isinstance(training.algorithm, ACKTR)
+    data = training.collector.rollout()
+    add_advantages(data, training.agent, training.gae)
+    return training, data
+
+
+def test_the_settings_are_those_of_the_paper() -> None:
+    settings = read_settings(make_config("algo=acktr", "belief=none"))
+    assert (settings.loss.gamma, settings.loss.lmbda) == (0.99, 0.97)
+    assert settings.collector.frames == 2560
+    assert settings.algo["desired_kl"] == 0.002
+    # what is given on the command line wins over what the entry sets in other groups
+    assert read_settings(make_config("algo=acktr", "loss.lmbda=0.9")).loss.lmbda == 0.9
+
+
+def test_a_run_leaves_its_numbers_and_no_column_of_ppo(smoke: Path) -> None:
+    rows = read_table(smoke / "metrics.csv")
+    assert [int(row["frames"]) for row in rows] == [128, 256, 384, 512]
+    filled = {key for key, value in rows[-1].items() if value}
+    assert {"return", "kl", "lr", "loss_objective", "loss_critic", "grad_norm"} < filled
+    assert {"clip_fraction", "ess", "loss_model"}.isdisjoint(filled)
+    assert len(read_table(smoke / "evaluation.csv")) == 4
+
+
+@pytest.mark.parametrize("belief", ["belief=none", "belief=fill belief.with_mask=true"])
+def test_a_stopped_run_goes_on_to_the_last_bit(smoke: Path, tmp_path: Path, belief: str) -> None:
+    overrides = [*SMOKE, *belief.split()]
+    whole, parts = smoke, tmp_path / "parts"
+    if belief != "belief=none":
+        whole = tmp_path / "whole"
+        run(make_config(*overrides), whole)
+    run(make_config(*overrides, "total_frames=256", "evaluation.final_episodes=0"), parts)
+    words = ["total_frames=512", "evaluation.final_episodes=3"]
+    assert run(resumed_config(make_config(*words), ["resume=x", *words], parts), parts) == 0
+    for table in ("metrics.csv", "episodes.csv"):
+        assert read_table(whole / table) == read_table(parts / table), table
+    states = [load_checkpoint(last_checkpoint(folder)) for folder in (whole, parts)]
+    for state in states:
+        del state["progress"]["evaluated_frames"]  # the parts were not evaluated on the way
+    assert differences(*states) == []
+    assert states[0]["policy_optimizer"]["state"]
+    assert states[0]["critic_optimizer"]["state"]
+
+
+def test_the_value_comes_nearer_to_its_targets() -> None:
+    training, data = rollout_of("algo.critic.steps=25", "algo.critic.lr=0.1")
+
+    def error() -> float:
+        with torch.no_grad():
+            value = training.agent.value(data)
+        return (value - data.get("value_target")).square().mean().item() / 2
+
+    before = error()
+    row = training.algorithm.update(data, 1.0)
+    assert row["loss_critic"] == pytest.approx(before, rel=1e-4)
+    assert error() < 0.5 * before
+
+
+def test_the_policy_climbs_its_objective_and_reports_its_divergence() -> None:
+    training, data = rollout_of("algo.policy.momentum=0", "algo.policy.lr=0.2")
+    advantage = data.get("advantage").squeeze(-1)
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    old = training.agent.actor.get_dist(data.select("features"))
+    row = training.algorithm.update(data, 1.0)
+    with torch.no_grad():
+        new = training.agent.actor.get_dist(data.select("features"))
+        ratio = new.log_prob(data["action"]) - old.log_prob(data["action"])
+    assert (ratio * advantage).mean() > 0
+    kl = torch.distributions.kl_divergence(old, new).mean().item()
+    assert row["kl"] == pytest.approx(kl, rel=1e-3)
+    assert 0 < kl < 2 * 5e-3  # within reach of the trust region's 5e-3
+
+
+@pytest.mark.parametrize(
+    ("desired", "factor"), [(1e-9, 1 / 1.5), (1.0, 1.5)], ids=["too far", "too near"]
+)
+def test_the_step_size_follows_the_divergence(desired: float, factor: float) -> None:
+    training, data = rollout_of(f"algo.desired_kl={desired}", "algo.policy.momentum=0")
+    steps = [training.algorithm.update(data, 1.0)["lr"] for _ in range(2)]
+    assert steps[0] == 0.03
+    assert steps[1] == pytest.approx(0.03 * factor)
+
+
+def test_the_divergence_comes_to_the_one_asked_for() -> None:
+    settings = read_settings(make_config(*SMOKE, "algo.policy.momentum=0.5"))
+    training = assemble(settings)
+    kls = [train_rollout(training, settings)[0]["kl"] for _ in range(40)]
+    assert 0.001 < sum(kls[20:]) / 20 < 0.004
+
+
+def test_the_generator_of_the_whole_process_is_left_alone() -> None:
+    training, data = rollout_of()
+    before = torch.get_rng_state()
+    training.algorithm.update(data, 1.0)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("belief", ["drbpn", "gru", "transformer"])
+def test_a_belief_with_weights_of_its_own_is_refused(belief: str) -> None:
+    settings = read_settings(make_config("algo=acktr", f"belief={belief}", "env=inverted_pendulum"))
+    with pytest.raises(UserError, match=rf"`algo=acktr` must have a belief.* got belief={belief}"):
+        build_algorithm(settings, make_agent(settings)[1])
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("algo._target_=assembly.nowhere.build", "`algo._target_` must name a builder such as"),
+        ("+algo.colour=red", "`algo=acktr`: .*colour"),
+        ("algo.desired_kl=0", "`algo=acktr`: `desired_kl` must be positive"),
+        ("algo.policy.damping=0", "`algo=acktr`: `damping` must be positive, got 0"),
+        ("algo.critic.momentum=1", r"`algo=acktr`: `momentum` must lie in \[0, 1\)"),
+    ],
+)
+def test_bad_settings_are_refused_in_one_line(override: str, line: str) -> None:
+    settings = read_settings(make_config(*SMOKE, override))
+    with pytest.raises(UserError, match=line) as error:
+        build_algorithm(settings, make_agent(settings)[1])
+    assert "\n" not in str(error.value)
+
+
+def test_the_report_tells_it_from_ppo_and_names_its_command(smoke: Path) -> None:
+    (study,) = read_study([smoke])
+    assert study.group["belief"] == "none (acktr)"
+    command = training_command(study)
+    words = shlex.split(command)[2:]
+    assert "algo=acktr" in words
+    again = read_settings(make_config(*(word for word in words if "hydra" not in word)))
+    # How often a run is saved is no part of its result, and of its command neither.
+    assert dataclasses.replace(again, checkpoint=study.settings.checkpoint) == study.settings

@@ -1,0 +1,280 @@
+"""Kronecker-factored natural-gradient steps, held to Fisher matrices written out in float64.
+
+The factors of a linear layer give its exact Fisher matrix where inputs and scores are independent;
+the step solves with the damped matrix, moves no further than the trust region, and goes on from a
+saved state as if it had never stopped.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+pytest.importorskip("hydra")
+import recipe_tools  # isort: skip  # noqa: F401  (puts the recipes on the path)
+
+from assembly.algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
+
+N = 40
+NUMBERS = {"lr": 1.0, "momentum": 0.0, "damping": 1e-12, "decay": 0.9, "max_kl": 1e9}
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def normal(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def white_noise(generator: torch.Generator, samples: int, components: int) -> Tensor:
+    """Noise whose second moments over the samples are the identity to the last digits."""
+    q, _ = torch.linalg.qr(normal(generator, samples, components))
+    return q * samples**0.5
+
+
+def network(generator: torch.Generator, *sizes: int) -> nn.Sequential:
+    """A tanh network in float64; the last layer is linear."""
+    layers: list[nn.Module] = []
+    for i, (inputs, outputs) in enumerate(zip(sizes, sizes[1:], strict=False)):
+        layers += [nn.Linear(inputs, outputs, dtype=torch.float64), nn.Tanh()]
+        for p in layers[2 * i].parameters():
+            p.data = 0.5 * normal(generator, *p.shape)
+    return nn.Sequential(*layers[:-1])
+
+
+def flat(weight: Tensor, bias: Tensor) -> Tensor:
+    """Weight and bias as one vector, column after column: kron(A, G) acts on it."""
+    return torch.cat([weight, bias[:, None]], 1).T.reshape(-1)
+
+
+def observe(optimizer: KFAC, module: nn.Module, inputs: Tensor, score: Tensor) -> Tensor:
+    with optimizer.recording():
+        output = module(inputs)
+    optimizer.observe(output, score)
+    return output
+
+
+# The factors ----------------------------------------------------------------------------------
+
+
+def test_the_factors_of_a_linear_gaussian_layer_are_its_exact_fisher_matrix(generator):
+    layer = network(generator, 3, 2)[0]
+    inputs, std = normal(generator, N, 3), torch.tensor([0.5, 2.0], dtype=torch.float64)
+    a, g = kronecker_factors(inputs, white_noise(generator, N, 2) / std)
+    # E[J' R^-1 J], J the derivative of the mean by the parameters, one sample at a time
+    exact = torch.zeros(8, 8, dtype=torch.float64)
+    for x in inputs:
+        rows = []
+        for k in range(2):
+            weight, bias = torch.autograd.grad(layer(x)[k], list(layer.parameters()))
+            rows.append(flat(weight, bias))
+        jacobian = torch.stack(rows)
+        exact += jacobian.T @ torch.diag(std**-2) @ jacobian / N
+    torch.testing.assert_close(torch.kron(a, g), exact, rtol=1e-12, atol=1e-12)
+
+
+def test_every_layer_of_a_network_has_the_second_moments_of_its_inputs_and_scores(generator):
+    module = network(generator, 3, 4, 2)
+    inputs, score = normal(generator, N, 3), normal(generator, N, 2)
+    optimizer = KFAC(module, **NUMBERS)
+    observe(optimizer, module, inputs, score)
+    expected: dict[int, list[Tensor]] = {0: [], 2: []}
+    for x, s in zip(inputs, score, strict=True):
+        # With input a and score g of one sample, its gradient by weight and bias is g [a, 1].
+        gradients = torch.autograd.grad(module(x) @ s, list(module.parameters()))
+        expected[0].append(torch.cat([gradients[0], gradients[1][:, None]], 1))
+        expected[2].append(torch.cat([gradients[2], gradients[3][:, None]], 1))
+    for place, hidden in ((0, inputs), (2, torch.tanh(module[0](inputs)).detach())):
+        state = optimizer.state[module[place].weight]
+        g = torch.stack([m[:, -1] for m in expected[place]])
+        a = torch.cat([hidden, torch.ones(N, 1, dtype=torch.float64)], 1)
+        for gradient, left, right in zip(expected[place], g, a, strict=True):
+            torch.testing.assert_close(gradient, torch.outer(left, right))
+        first = 1 - NUMBERS["decay"]
+        torch.testing.assert_close(state["a"] / first, a.T @ a / N)
+        torch.testing.assert_close(state["g"] / first, g.T @ g / N)
+
+
+def test_the_curvature_is_a_weighted_mean_of_what_was_observed(generator):
+    layer, decay = network(generator, 3, 2)[0], 0.7
+    optimizer = KFAC(layer, **{**NUMBERS, "decay": decay})
+    batches = [(normal(generator, N, 3), normal(generator, N, 2)) for _ in range(3)]
+    for inputs, score in batches:
+        observe(optimizer, layer, inputs, score)
+    weights = torch.tensor([decay**2, decay, 1.0], dtype=torch.float64)
+    factors = [kronecker_factors(*batch) for batch in batches]
+    state = optimizer.state[layer.weight]
+    for key, values in zip("ag", zip(*factors, strict=True), strict=True):
+        mean = sum(w * f for w, f in zip(weights / weights.sum(), values, strict=True))
+        torch.testing.assert_close(state[key] / (1 - decay**3), mean)
+
+
+# The direction --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("samples", [N, 2], ids=["full rank", "deficient"])
+def test_the_natural_gradient_solves_with_the_damped_kronecker_matrix(generator, samples):
+    a, g = kronecker_factors(normal(generator, samples, 4), normal(generator, samples, 3))
+    gradient, damping = normal(generator, 3, 5), 0.03
+    solution = solve_kronecker(gradient, a, g, damping)
+    matrix = torch.kron(a, g) + damping * torch.eye(15, dtype=torch.float64)
+    expected = torch.linalg.solve(matrix, gradient.T.reshape(-1)).reshape(5, 3).T
+    torch.testing.assert_close(solution, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_one_step_solves_linear_regression(generator):
+    """With unit step size and no damping a natural-gradient step is Newton's."""
+    layer = network(generator, 3, 2)[0]
+    inputs, target = normal(generator, N, 3), normal(generator, N, 2)
+    optimizer = KFAC(layer, **NUMBERS)
+    output = observe(optimizer, layer, inputs, white_noise(generator, N, 2))
+    ((output - target).square().sum(-1).mean() / 2).backward()
+    optimizer.step()
+    design = torch.cat([inputs, torch.ones(N, 1, dtype=torch.float64)], 1)
+    best = torch.linalg.lstsq(design, target).solution.T
+    torch.testing.assert_close(layer.weight, best[:, :-1], rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(layer.bias, best[:, -1], rtol=1e-8, atol=1e-8)
+
+
+def test_the_fisher_information_of_a_log_std_is_two_and_its_step_divides_by_it():
+    log_std = nn.Parameter(torch.tensor([0.3, -1.0], dtype=torch.float64))
+    old = torch.distributions.Normal(torch.zeros(2, dtype=torch.float64), log_std.detach().exp())
+
+    def divergence(value: Tensor) -> Tensor:
+        new = torch.distributions.Normal(torch.zeros_like(value), value.exp())
+        return torch.distributions.kl_divergence(old, new).sum()
+
+    fisher = torch.autograd.functional.hessian(divergence, log_std.detach())
+    torch.testing.assert_close(fisher, 2 * torch.eye(2, dtype=torch.float64))
+    module = nn.Module()
+    module.log_std = log_std
+    optimizer = KFAC(module, **{**NUMBERS, "damping": 0.5}, constant_fisher={log_std: 2.0})
+    before = log_std.detach().clone()
+    log_std.grad = torch.tensor([1.0, -3.0], dtype=torch.float64)
+    optimizer.step()
+    torch.testing.assert_close(before - log_std.detach(), log_std.grad / 2.5)
+
+
+# The length -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("max_kl", [1e-4, 0.3])
+def test_a_long_step_is_shortened_to_the_divergence_asked_for(generator, max_kl):
+    """The divergence of a linear Gaussian model is quadratic: here the prediction is the truth."""
+    layer, std = network(generator, 3, 2)[0], torch.tensor([0.5, 2.0], dtype=torch.float64)
+    inputs = normal(generator, N, 3)
+    optimizer = KFAC(layer, **{**NUMBERS, "lr": 100.0, "max_kl": max_kl})
+    old = observe(optimizer, layer, inputs, white_noise(generator, N, 2) / std)
+    (old - normal(generator, N, 2)).square().mean().backward()
+    predicted = optimizer.step()
+    true = ((layer(inputs) - old) / std).square().sum(-1).mean() / 2
+    torch.testing.assert_close(predicted, torch.tensor(max_kl, dtype=torch.float64))
+    torch.testing.assert_close(true, predicted, rtol=1e-6, atol=0.0)
+
+
+def test_a_short_step_keeps_its_length_and_its_prediction(generator):
+    layer, inputs = network(generator, 3, 2)[0], normal(generator, N, 3)
+    far = copy.deepcopy(layer)
+    noise, target = white_noise(generator, N, 2), normal(generator, N, 2)
+    moves = []
+    for module, lr in ((layer, 1e-3), (far, 2e-3)):
+        optimizer = KFAC(module, **{**NUMBERS, "lr": lr})
+        old = observe(optimizer, module, inputs, noise)
+        (old - target).square().mean().backward()
+        predicted = optimizer.step()
+        moves.append(module(inputs) - old)
+        true = moves[-1].square().sum(-1).mean() / 2
+        torch.testing.assert_close(predicted, true, rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(2 * moves[0], moves[1])
+
+
+def test_the_steps_are_averaged_by_momentum():
+    parameter = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    module = nn.Module()
+    module.parameter = parameter
+    numbers = {**NUMBERS, "lr": 0.5, "momentum": 0.9}
+    optimizer = KFAC(module, **numbers, constant_fisher={parameter: 1.0})
+    parameter.grad = torch.ones(1, dtype=torch.float64)
+    positions = [0.0]
+    for _ in range(200):
+        optimizer.step()
+        positions.append(parameter.item())
+    assert positions[1] == pytest.approx(-0.5 * 0.1)
+    assert positions[2] - positions[1] == pytest.approx(-0.5 * 0.1 * 1.9)
+    assert positions[-1] - positions[-2] == pytest.approx(-0.5)
+
+
+# The state ------------------------------------------------------------------------------------
+
+
+def test_a_saved_state_goes_on_to_the_last_bit(generator):
+    module = network(generator, 3, 4, 2)
+    numbers = {**NUMBERS, "lr": 0.1, "momentum": 0.9, "damping": 1e-2, "max_kl": 1e-2}
+    optimizer = KFAC(module, **numbers)
+    batches = [[normal(generator, N, 3), *normal(generator, 2, N, 2)] for _ in range(6)]
+
+    def learn(optimizer: KFAC, module: nn.Module, inputs: Tensor, noise: Tensor, y: Tensor) -> None:
+        output = observe(optimizer, module, inputs, noise)
+        optimizer.zero_grad()
+        (output - y).square().mean().backward()
+        optimizer.step()
+
+    for batch in batches[:3]:
+        learn(optimizer, module, *batch)
+    other = copy.deepcopy(module)
+    saved = copy.deepcopy(optimizer.state_dict())
+    again = KFAC(other, **numbers)
+    again.load_state_dict(saved)
+    for batch in batches[3:]:
+        learn(optimizer, module, *batch)
+        learn(again, other, *batch)
+    for mine, theirs in zip(module.parameters(), other.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+def test_recording_leaves_the_module_as_it_was(generator):
+    module = network(generator, 3, 4, 2)
+    optimizer = KFAC(module, **NUMBERS)
+    with pytest.raises(RuntimeError), optimizer.recording():
+        module(normal(generator, N, 5))
+    assert not any(layer._forward_hooks for layer in module)
+
+
+def test_a_step_before_any_curvature_is_refused(generator):
+    layer = network(generator, 3, 2)[0]
+    layer(normal(generator, N, 3)).sum().backward()
+    with pytest.raises(RuntimeError, match="`step` needs a curvature: call `observe` first"):
+        KFAC(layer, **NUMBERS).step()
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        (nn.Sequential(nn.Linear(2, 2), nn.LayerNorm(2)), "got 1.weight, 1.bias"),
+        (nn.Linear(2, 2, bias=False), "got a layer without bias"),
+    ],
+    ids=["layer-norm", "no-bias"],
+)
+def test_other_layers_are_refused_by_name(module, line):
+    with pytest.raises(ValueError, match=f"`module` must hold linear layers.*{line}"):
+        KFAC(module, **NUMBERS)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "line"),
+    [
+        ("lr", 0.0, "`lr` must be positive, got 0.0"),
+        ("damping", 0.0, "`damping` must be positive"),
+        ("max_kl", -1.0, "`max_kl` must be positive"),
+        ("momentum", 1.0, r"`momentum` must lie in \[0, 1\), got 1.0"),
+        ("decay", -0.1, r"`decay` must lie in \[0, 1\)"),
+    ],
+)
+def test_numbers_without_sense_are_refused(name, value, line):
+    with pytest.raises(ValueError, match=line):
+        KFAC(nn.Linear(2, 2), **{**NUMBERS, name: value})
