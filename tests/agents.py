@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from contracts import with_belief_entries
+from contract_beliefs import with_belief_entries
 from tensordict import TensorDictBase
 from tensordict.nn import (
     NormalParamExtractor,
@@ -84,6 +84,7 @@ def make_agent(
     features: str = "features",
     dtype: torch.dtype = torch.float64,
     init_std: float = 2.0,
+    actions: int = ACTION,
 ) -> Agent:
     """Heads of fixed weights; a wide policy makes the poles fall soon."""
     with torch.random.fork_rng():
@@ -91,7 +92,7 @@ def make_agent(
         head = nn.Sequential(
             nn.Linear(feature_dim, 8, dtype=dtype),
             nn.Tanh(),
-            nn.Linear(8, 2 * ACTION, dtype=dtype),
+            nn.Linear(8, 2 * actions, dtype=dtype),
             NormalParamExtractor(scale_mapping=f"biased_softplus_{init_std}"),
         )
         actor = ProbabilisticActor(
@@ -112,12 +113,17 @@ def make_env(dtype: torch.dtype = torch.float64, seed: int = 0) -> TransformedEn
     return with_belief_entries(TransformedEnv(base, Compose()), to_float32=False)
 
 
-def collect(agent: Agent, batches: int = 2, dtype: torch.dtype = torch.float64) -> TensorDictBase:
+def collect(
+    agent: Agent,
+    batches: int = 2,
+    dtype: torch.dtype = torch.float64,
+    env: TransformedEnv | None = None,
+) -> TensorDictBase:
     """The last of some batches of (ENVS, TIME) steps: rows that start in mid-episode."""
     with torch.random.fork_rng():
         torch.manual_seed(2)
         collector = Collector(
-            make_env(dtype),
+            make_env(dtype) if env is None else env,
             agent.policy,
             frames_per_batch=ENVS * TIME,
             total_frames=batches * ENVS * TIME,

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 import torch
+from belief_frames import BeliefFrames
 from contract_environments import ACTION, OBS, StaircaseEnv, parallel_env, saved
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
@@ -62,7 +63,7 @@ def with_belief_entries(
     return env
 
 
-class BeliefModuleContract:
+class BeliefModuleContract(BeliefFrames):
     """Duties of a belief module: what `GRUModule` does in a TorchRL pipeline, and the age rule.
 
     `is_init & (age == 0)` starts from the module's own beginning; `is_init` with an older age takes
@@ -70,14 +71,9 @@ class BeliefModuleContract:
 
     Attributes:
         age_key: the root entry that counts updates since the reset.
-        tolerance32: how far one step at a time and whole sequences may differ in float32, as a
-            share of the largest entry.
-        tolerance64: the same in float64.
     """
 
     age_key: Any = ("recurrent", "age")
-    tolerance32: float = 1e-5
-    tolerance64: float = 1e-10
 
     # --- hooks
     def make_module(
@@ -89,88 +85,6 @@ class BeliefModuleContract:
     def differentiable(self, out: TensorDictBase) -> torch.Tensor:
         """Return a number that depends on everything the module learns from."""
         return out["features"].square().mean()
-
-    # --- helpers
-    def make_frames(
-        self, shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0
-    ) -> TensorDict:
-        """Return what the environment writes, nowhere an episode start."""
-        g = torch.Generator().manual_seed(seed)
-        observed = torch.rand(*shape, OBS, generator=g) < 0.6
-        observation = torch.randn(*shape, OBS, generator=g, dtype=dtype)
-        return TensorDict(
-            {
-                "observation": torch.where(observed, observation, 0.0),
-                "observed": observed,
-                "previous_action": torch.randn(*shape, ACTION, generator=g, dtype=dtype),
-                "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
-            },
-            shape,
-        )
-
-    def state_keys(self, module: TensorDictModuleBase) -> list[Any]:
-        return list(module.make_tensordict_primer().primers.keys(True, True))
-
-    def some_state(
-        self, module: TensorDictModuleBase, shape: tuple[int, ...], seed: int = 1
-    ) -> TensorDict:
-        """Return a recurrent state in mid-episode: what the module wrote after two steps."""
-        dtype = next(module.parameters()).dtype
-        frames = self.make_frames((*shape, 2), dtype, seed)
-        frames["is_init"][..., 0, :] = True
-        with torch.no_grad():
-            return self.one_by_one(module, frames, None)["next"][..., -1].select(
-                *self.state_keys(module)
-            )
-
-    def one_by_one(
-        self, module: TensorDictModuleBase, frames: TensorDict, start: TensorDict | None
-    ) -> TensorDict:
-        """Run step by step as a collector does; the primer's zeros where an episode starts.
-
-        The result holds the stored state at every step, as a collected rollout does.
-        """
-        keys = self.state_keys(module)
-        primers = module.make_tensordict_primer().primers
-        batch = frames.shape[:-1]
-        zeros = TensorDict({k: primers[k].expand(*batch, *primers[k].shape).zero() for k in keys})
-        carried = zeros if start is None else start
-        steps = []
-        for t in range(frames.shape[-1]):
-            step = frames[..., t].clone()
-            for key in keys:
-                first = step["is_init"].reshape(*batch, *([1] * (primers[key].ndim)))
-                step.set(key, torch.where(first, zeros[key], carried[key]))
-            with set_recurrent_mode(False):
-                module(step)
-            carried = step["next"]
-            steps.append(step)
-        return torch.stack(steps, len(batch))
-
-    def as_sequence(self, module: TensorDictModuleBase, rollout: TensorDict) -> TensorDict:
-        """Run over time from what a rollout stores, with what the module wrote left out."""
-        keys = ["observation", "observed", "previous_action", "is_init"]
-        with set_recurrent_mode(True):
-            return module(rollout.select(*keys, *self.state_keys(module)))
-
-    def written(self, module: TensorDictModuleBase) -> list[Any]:
-        return [k for k in module.out_keys if not (isinstance(k, tuple) and k[0] == "next")]
-
-    def assert_same(
-        self, module: TensorDictModuleBase, received: TensorDictBase, expected: TensorDictBase
-    ) -> None:
-        for key in self.written(module):
-            dtype = expected[key].dtype
-            limit = self.tolerance64 if dtype == torch.float64 else self.tolerance32
-            # The largest entry sets the scale: beliefs of raw sensors may be far from 1.
-            scale = max(1.0, expected[key].abs().max().item())
-            torch.testing.assert_close(
-                received[key],
-                expected[key],
-                rtol=limit,
-                atol=limit * scale,
-                msg=lambda text, key=key: f"{key}: {text}",
-            )
 
     # --- keys
     def test_every_out_key_is_written_and_no_other(self):

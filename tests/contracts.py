@@ -15,6 +15,9 @@ copies, dtypes and devices.
 `BeliefModuleContract` is what `GRUModule` does in a TorchRL pipeline (one step or whole sequences,
 primer, collector, batched environments, compile, export), and this package's rule for what a
 recurrent module starts from: the beginning where `is_init & (age == 0)`, else the stored state.
+
+`RecipeBeliefContract` is what the recipe needs of any belief module, with or without memory, with
+or without a model.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ from contract_environments import (
     with_transform,
 )
 from contract_losses import LossContract
+from contract_recipe_beliefs import RecipeBeliefContract
 from contract_transforms import TransformContract
 
 __all__ = [
@@ -42,6 +46,7 @@ __all__ = [
     "OBS",
     "BeliefModuleContract",
     "LossContract",
+    "RecipeBeliefContract",
     "StaircaseEnv",
     "TransformContract",
     "actions_in_float64",

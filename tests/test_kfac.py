@@ -16,6 +16,8 @@ from torch import Tensor, nn
 pytest.importorskip("hydra")
 import recipe_tools  # isort: skip  # noqa: F401  (puts the recipes on the path)
 
+import itertools
+
 from assembly.algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
 
 N = 40
@@ -40,7 +42,7 @@ def white_noise(generator: torch.Generator, samples: int, components: int) -> Te
 def network(generator: torch.Generator, *sizes: int) -> nn.Sequential:
     """A tanh network in float64; the last layer is linear."""
     layers: list[nn.Module] = []
-    for i, (inputs, outputs) in enumerate(zip(sizes, sizes[1:], strict=False)):
+    for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
         layers += [nn.Linear(inputs, outputs, dtype=torch.float64), nn.Tanh()]
         for p in layers[2 * i].parameters():
             p.data = 0.5 * normal(generator, *p.shape)

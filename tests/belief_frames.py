@@ -1,0 +1,114 @@
+"""Frames for belief modules, and the two ways to run over them; see contracts.py."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from contract_environments import ACTION, OBS
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose
+from torchrl.modules import set_recurrent_mode
+from torchrl.modules.utils import get_primers_from_module
+
+FRAME_KEYS = ("observation", "observed", "previous_action", "is_init")
+
+
+class BeliefFrames:
+    """What the contracts of belief modules share; no test is in here.
+
+    Attributes:
+        tolerance32: how far one step at a time and whole sequences may differ in float32, as a
+            share of the largest entry.
+        tolerance64: the same in float64.
+    """
+
+    tolerance32: float = 1e-5
+    tolerance64: float = 1e-10
+
+    def make_frames(
+        self, shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0
+    ) -> TensorDict:
+        """Return what the environment writes, nowhere an episode start."""
+        g = torch.Generator().manual_seed(seed)
+        observed = torch.rand(*shape, OBS, generator=g) < 0.6
+        observation = torch.randn(*shape, OBS, generator=g, dtype=dtype)
+        return TensorDict(
+            {
+                "observation": torch.where(observed, observation, 0.0),
+                "observed": observed,
+                "previous_action": torch.randn(*shape, ACTION, generator=g, dtype=dtype),
+                "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
+            },
+            shape,
+        )
+
+    def primers(self, module: TensorDictModuleBase) -> dict[Any, Any]:
+        """Return the specs of the recurrent state; none where the module has no memory."""
+        found = get_primers_from_module(module, warn=False)
+        parts = [] if found is None else found if isinstance(found, Compose) else [found]
+        return {key: spec for part in parts for key, spec in part.primers.items(True, True)}
+
+    def state_keys(self, module: TensorDictModuleBase) -> list[Any]:
+        return list(self.primers(module))
+
+    def some_state(
+        self, module: TensorDictModuleBase, shape: tuple[int, ...], seed: int = 1
+    ) -> TensorDict:
+        """Return a recurrent state in mid-episode: what the module wrote after two steps."""
+        dtype = next(module.parameters()).dtype
+        frames = self.make_frames((*shape, 2), dtype, seed)
+        frames["is_init"][..., 0, :] = True
+        with torch.no_grad():
+            return self.one_by_one(module, frames, None)["next"][..., -1].select(
+                *self.state_keys(module)
+            )
+
+    def one_by_one(
+        self, module: TensorDictModuleBase, frames: TensorDict, start: TensorDict | None
+    ) -> TensorDict:
+        """Run step by step as a collector does; the primer's zeros where an episode starts.
+
+        The result holds the stored state at every step, as a collected rollout does.
+        """
+        keys = self.state_keys(module)
+        primers = self.primers(module)
+        batch = frames.shape[:-1]
+        zeros = TensorDict({k: primers[k].expand(*batch, *primers[k].shape).zero() for k in keys})
+        carried = zeros if start is None else start
+        steps = []
+        for t in range(frames.shape[-1]):
+            step = frames[..., t].clone()
+            for key in keys:
+                first = step["is_init"].reshape(*batch, *([1] * (primers[key].ndim)))
+                step.set(key, torch.where(first, zeros[key], carried[key]))
+            with set_recurrent_mode(False):
+                module(step)
+            carried = step.get("next", None)  # a module without memory writes none
+            steps.append(step)
+        return torch.stack(steps, len(batch))
+
+    def as_sequence(self, module: TensorDictModuleBase, rollout: TensorDict) -> TensorDict:
+        """Run over time from what a rollout stores, with what the module wrote left out."""
+        with set_recurrent_mode(True):
+            return module(rollout.select(*FRAME_KEYS, *self.state_keys(module)))
+
+    def written(self, module: TensorDictModuleBase) -> list[Any]:
+        return [k for k in module.out_keys if not (isinstance(k, tuple) and k[0] == "next")]
+
+    def assert_same(
+        self, module: TensorDictModuleBase, received: TensorDictBase, expected: TensorDictBase
+    ) -> None:
+        for key in self.written(module):
+            dtype = expected[key].dtype
+            limit = self.tolerance64 if dtype == torch.float64 else self.tolerance32
+            # The largest entry sets the scale: beliefs of raw sensors may be far from 1.
+            scale = max(1.0, expected[key].abs().max().item())
+            torch.testing.assert_close(
+                received[key],
+                expected[key],
+                rtol=limit,
+                atol=limit * scale,
+                msg=lambda text, key=key: f"{key}: {text}",
+            )

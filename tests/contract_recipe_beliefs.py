@@ -1,0 +1,310 @@
+"""Duties of every belief module of a recipe; see contracts.py."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import TYPE_CHECKING
+
+import agents
+import pytest
+import torch
+from belief_frames import FRAME_KEYS, BeliefFrames
+from contract_environments import ACTION, OBS, StaircaseEnv, saved
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import Compose, InitTracker, StepCounter, Transform, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from torchrl_drbpn import (
+    DRBPNLoss,
+    MaskedObservationNorm,
+    ObservationMissingness,
+    ObservationNoise,
+    PreviousAction,
+)
+
+if TYPE_CHECKING:
+    from assembly.beliefs import Belief
+
+LOG_LIKELIHOOD = ("belief", "log_likelihood")
+
+
+class RecipeBeliefContract(BeliefFrames):
+    """Duties of what a builder under recipes/assembly/beliefs returns.
+
+    With or without memory, with or without a model: the recipe gives every belief module the same
+    entries and reads `features`; it collects step by step, learns over sequences cut from the
+    rollout, values the next beliefs in one step, and writes everything into files.
+    """
+
+    # --- hooks
+    def make_belief(self, obs: int = OBS, action: int = ACTION) -> Belief:
+        """Return a belief in float32, equal to every other made with the same arguments."""
+        raise NotImplementedError
+
+    # --- helpers
+    def frames(self, time: int = 6) -> TensorDict:
+        """Return three rows that begin an episode; one of them begins another."""
+        frames = self.make_frames((3, time))
+        frames["is_init"][:, 0] = True
+        frames["is_init"][1, time // 2] = True
+        return frames
+
+    def sequence(self, belief: Belief, frames: TensorDict) -> TensorDict:
+        """Run over time from what a collector that saw the same frames would have stored."""
+        with torch.no_grad():
+            stored = self.one_by_one(belief.module, frames.detach(), None)
+        states = stored.select(*self.state_keys(belief.module))
+        return self.as_sequence(belief.module, frames.copy().update(states))
+
+    def learned_belief(self) -> Belief:
+        """Return a belief away from where it starts: some start with layers of zeros."""
+        belief = self.make_belief()
+        g = torch.Generator().manual_seed(0)
+        with torch.no_grad():
+            for parameter in belief.module.parameters():
+                parameter += 0.05 * torch.randn(parameter.shape, generator=g)
+        return belief
+
+    def make_env(self, belief: Belief) -> TransformedEnv:
+        """Return four rows dressed as the recipe does, two that terminate, one that is cut off."""
+        transforms = (
+            PreviousAction(),
+            ObservationNoise(100.0),
+            ObservationMissingness("mcar", 0.5, always_observed=0.0),
+            *belief.transforms(),
+            MaskedObservationNorm(),
+            StepCounter(max_steps=5),
+            InitTracker(),
+        )
+        return TransformedEnv(StaircaseEnv(4), Compose(*transforms))
+
+    def collected(self, belief: Belief) -> tuple[agents.Agent, TensorDictBase]:
+        """Return heads and a rollout whose rows begin in mid-episode, with ends of both kinds."""
+        agent = agents.make_agent(
+            belief.module, belief.feature_dim, dtype=torch.float32, actions=ACTION
+        )
+        data = agents.collect(agent, env=self.make_env(belief))
+        assert data.shape == (4, 18)
+        assert not data["is_init"][:, 0].all()
+        terminated, truncated = data["next", "terminated"], data["next", "truncated"]
+        assert (terminated & ~truncated)[:, :-1].any()
+        assert (truncated & ~terminated)[:, :-1].any()
+        return agent, data
+
+    # --- keys
+    @pytest.mark.parametrize("shape", [(), (2,), (2, 3)])
+    def test_features_have_their_width_at_every_batch_shape(self, shape):
+        belief = self.make_belief()
+        step = self.make_frames(shape)
+        for key, spec in self.primers(belief.module).items():
+            step.set(key, spec.expand(*shape, *spec.shape).zero())
+        out = belief.module(step)
+        assert out["features"].shape == (*shape, belief.feature_dim)
+        assert out["features"].dtype == torch.float32
+        assert out["features"].isfinite().all()
+
+    def test_it_reads_what_every_environment_writes_and_its_own_state(self):
+        module = self.make_belief().module
+        assert "observation" in module.in_keys
+        assert set(module.in_keys) <= {*FRAME_KEYS, *self.state_keys(module)}
+
+    def test_every_out_key_is_written_and_no_other(self):
+        belief = self.make_belief()
+        rollout = self.one_by_one(belief.module, self.frames(), None)
+        names = {*FRAME_KEYS, *self.state_keys(belief.module), *belief.module.out_keys}
+        for out in (rollout, self.as_sequence(belief.module, rollout)):
+            assert set(out.keys(True, True)) == names
+            for key in belief.module.out_keys:
+                assert out[key].shape == rollout[key].shape, key
+                assert out[key].dtype == rollout[key].dtype, key
+
+    def test_its_primers_are_found_and_its_state_is_written_for_the_next_step(self):
+        module = self.make_belief().module
+        step = self.one_by_one(module, self.frames(1), None)[:, 0]
+        for key, spec in self.primers(module).items():
+            following = ("next", key) if isinstance(key, str) else ("next", *key)
+            assert following in module.out_keys
+            assert step[following].shape == (3, *spec.shape), key
+            assert step[following].dtype == spec.dtype, key
+
+    def test_a_model_loss_goes_with_a_likelihood(self):
+        belief = self.make_belief()
+        assert (belief.model_loss is not None) == (LOG_LIKELIHOOD in belief.module.out_keys)
+
+    def test_what_was_read_is_left_as_it_was(self):
+        module = self.make_belief().module
+        rollout = self.one_by_one(module, self.frames(), None).select(*module.in_keys)
+        before = rollout.clone()
+        with set_recurrent_mode(True):
+            module(rollout)
+        for key in module.in_keys:
+            assert torch.equal(rollout[key], before[key]), key
+
+    # --- steps and sequences
+    def test_step_by_step_equals_the_whole_sequence(self):
+        belief = self.make_belief()
+        frames = self.frames(9)
+        expected = self.one_by_one(belief.module, frames, None)
+        self.assert_same(belief.module, self.sequence(belief, frames), expected)
+
+    def test_a_reset_inside_a_row_equals_two_rows(self):
+        belief = self.make_belief()
+        frames = self.frames(8)
+        frames["is_init"][:, 4] = True
+        parts = [self.sequence(belief, part) for part in (frames[:, :4], frames[:, 4:])]
+        self.assert_same(belief.module, self.sequence(belief, frames), torch.cat(parts, 1))
+
+    def test_a_rollout_is_what_sequences_cut_from_it_give(self):
+        belief = self.learned_belief()
+        _, data = self.collected(belief)
+        with torch.no_grad():
+            self.assert_same(belief.module, self.as_sequence(belief.module, data), data)
+            for start in (1, 7, 13):
+                cut = self.as_sequence(belief.module, data[:, start:])
+                self.assert_same(belief.module, cut, data[:, start:])
+
+    def test_one_step_from_what_is_stored_gives_every_belief_that_follows(self):
+        belief = self.learned_belief()
+        _, data = self.collected(belief)
+        module, stored = belief.module, data["features"]
+        keys = [*FRAME_KEYS, *self.state_keys(module)]
+        with torch.no_grad():
+            following = module(data["next"].select(*module.in_keys).reshape(-1))
+        following = following["features"].reshape_as(stored)
+        limit = self.tolerance32 * max(1.0, stored.abs().max().item())
+        done = data["next", "done"].squeeze(-1)
+        goes_on = ~done[:, :-1]
+        torch.testing.assert_close(
+            following[:, :-1][goes_on], stored[:, 1:][goes_on], rtol=self.tolerance32, atol=limit
+        )
+        # Where an episode ends, terminated or truncated, what follows is the next observation of
+        # the same row, as if it went on.
+        for kind in ("terminated", "truncated"):
+            row, time = (data["next", kind].squeeze(-1) & done)[:, 3:].nonzero()[0].tolist()
+            time += 3
+            begins = data["is_init"][row, : time + 1].flatten().nonzero()
+            start = int(begins[-1]) if len(begins) else 0
+            whole = [data[row : row + 1, start : time + 1].select(*keys)]
+            whole.append(data["next"][row : row + 1, time : time + 1].select(*keys))
+            with torch.no_grad():
+                expected = self.as_sequence(module, torch.cat(whole, 1))["features"][0, -1]
+            torch.testing.assert_close(
+                following[row, time], expected, rtol=self.tolerance32, atol=limit
+            )
+
+    # --- what arrived
+    def test_features_follow_what_arrived(self):
+        belief = self.make_belief()
+        frames = self.frames()
+        frames["observation"].requires_grad_()
+        out = self.sequence(belief, frames)["features"]
+        (grad,) = torch.autograd.grad(out.square().sum(), frames["observation"])
+        assert grad.isfinite().all()
+        assert (grad[frames["observed"]] != 0).float().mean() > 0.9
+
+    def test_the_likelihood_counts_what_arrived_and_nothing_else(self):
+        belief = self.make_belief()
+        if belief.model_loss is None:
+            return
+        frames = self.frames()
+        frames["observed"][:, -1] = torch.arange(OBS) < 2
+        frames["observation"][:, -1, 2:] = 0.0
+        before = self.sequence(belief, frames)[LOG_LIKELIHOOD]
+        assert (before[:, -1] != 0).all()
+        # the number that stands where nothing arrived is not counted
+        changed = frames.clone()
+        changed["observation"][:, -1] += 0.5 * ~frames["observed"][:, -1]
+        after = self.sequence(belief, changed)[LOG_LIKELIHOOD]
+        torch.testing.assert_close(after[:, -1], before[:, -1])
+        # and a 0 that arrived is a reading, not a gap
+        changed = frames.clone()
+        changed["observed"][:, -1] = True
+        assert (self.sequence(belief, changed)[LOG_LIKELIHOOD] != before)[:, -1].all()
+
+    def test_a_long_outage_leaves_it_finite(self):
+        belief = self.make_belief()
+        frames = self.make_frames((2, 60))
+        frames["is_init"][:, 0] = True
+        frames["observed"][:, 2:] = False
+        frames["observation"][:, 2:] = 0.0
+        out = self.sequence(belief, frames)
+        for key in self.written(belief.module):
+            assert out[key].isfinite().all(), key
+        if out["features"].requires_grad:
+            out["features"].square().mean().backward()
+            for name, parameter in belief.module.named_parameters():
+                assert parameter.grad is None or parameter.grad.isfinite().all(), name
+
+    # --- learning
+    def test_fresh_data_give_a_ratio_of_one_and_every_parameter_a_gradient(self):
+        belief = self.learned_belief()
+        agent, data = self.collected(belief)
+        with torch.no_grad():
+            data["state_value"] = agent.critic.module(data["features"])
+            following = belief.module(data["next"].select(*belief.module.in_keys).reshape(-1))
+            value = agent.critic.module(following["features"])
+            data["next", "state_value"] = value.reshape(*data.shape, 1)
+            GAE(gamma=0.99, lmbda=0.95, value_network=None)(data)
+        ppo = ClipPPOLoss(agent.actor, agent.critic, normalize_advantage=True)
+        loss = DRBPNLoss(belief.module, ppo, belief.model_loss)
+        assert "features" not in loss.in_keys
+        data["final"] = torch.zeros(*data.shape, 1, dtype=torch.bool)
+        data["final"][:, -1] = True
+        # sequences of 6, each from the state that the collector stored at its first step
+        out = loss(data.select(*loss.in_keys, strict=False).reshape(-1).reshape(-1, 6))
+        assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
+        torch.testing.assert_close(out["ESS"], torch.ones_like(out["ESS"]), rtol=1e-4, atol=0)
+        assert out["kl_approx"].item() == pytest.approx(0, abs=1e-4)
+        assert ("loss_model" in out) == (belief.model_loss is not None)
+        total = sum(value for key, value in out.items() if key.startswith("loss"))
+        assert isinstance(total, torch.Tensor)
+        total.backward()
+        for name, parameter in belief.module.named_parameters():
+            assert parameter.grad is not None, name
+            assert parameter.grad.isfinite().all(), name
+            assert parameter.grad.any(), name
+
+    def test_the_global_generator_is_untouched(self):
+        belief = self.make_belief()
+        state = torch.get_rng_state()
+        self.one_by_one(belief.module, self.frames(2), None)
+        self.sequence(belief, self.frames())
+        belief.summary()
+        assert torch.equal(torch.get_rng_state(), state)
+
+    # --- files and copies
+    def test_the_state_survives_a_file(self):
+        first, second = self.make_belief(), self.make_belief()
+        with torch.no_grad():
+            for parameter in first.module.parameters():
+                parameter += 0.05
+        second.module.load_state_dict(saved(first.module.state_dict()))
+        expected = self.sequence(first, self.frames())["features"]
+        assert torch.equal(self.sequence(second, self.frames())["features"], expected)
+
+    def test_a_deepcopy_computes_the_same_and_shares_nothing(self):
+        first = self.make_belief().module
+        second = copy.deepcopy(first)
+        frames = self.one_by_one(first, self.frames(), None).select(*first.in_keys)
+        with set_recurrent_mode(True), torch.no_grad():
+            expected = first(frames.clone())["features"].clone()
+            for parameter in first.parameters():
+                parameter.fill_(0.3)
+            assert torch.equal(second(frames.clone())["features"], expected)
+
+    # --- what the recipe asks for besides
+    def test_its_transforms_are_made_anew_and_fit_the_environment(self):
+        belief = self.learned_belief()
+        first, second = belief.transforms(), belief.transforms()
+        assert all(isinstance(t, Transform) for t in first)
+        assert not {id(t) for t in first} & {id(t) for t in second}
+        check_env_specs(self.make_env(belief))
+
+    def test_its_summary_is_finite_numbers_by_name(self):
+        summary = self.make_belief().summary()
+        assert all(isinstance(name, str) for name in summary)
+        assert all(isinstance(value, float) and math.isfinite(value) for value in summary.values())

@@ -1,0 +1,97 @@
+"""Every belief of conf/belief, found on disk: the duties of all, and a run of each.
+
+A new file there is tested here without an edit. What one of them does that others do not stands in
+test_baseline_beliefs.py, test_belief_filter_module.py and test_particle_filter.py.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from importlib import import_module
+
+import pytest
+import torch
+from contracts import ACTION, OBS, RecipeBeliefContract, saved
+
+pytest.importorskip("hydra")
+from recipe_tools import BELIEFS, differences, make_config  # isort: skip
+
+from assembly.beliefs import Belief, build_belief
+from assembly.errors import UserError
+from assembly.settings import read_settings
+from assembly.training import (
+    assemble,
+    metric_columns,
+    restore,
+    train_rollout,
+    training_state,
+)
+
+# Choices inside a belief that change what it reads, writes or remembers.
+FURTHER = [
+    "drbpn belief.policy_input=mean_cov belief.transition.cov_network=true",
+    "fill belief.with_mask=true",
+    "gru belief.cell=lstm",
+    "none belief.with_mask=true",
+    "transformer belief.window=4",
+]
+
+
+@functools.cache
+def settings_of(name: str) -> dict:
+    return make_config(*f"belief={name}".split())["belief"]
+
+
+class TestEveryBelief(RecipeBeliefContract):
+    @pytest.fixture(autouse=True, params=[*BELIEFS, *FURTHER])
+    def _name(self, request: pytest.FixtureRequest) -> None:
+        self.name = request.param
+
+    def make_belief(self, obs: int = OBS, action: int = ACTION) -> Belief:
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return build_belief(
+                settings_of(self.name), obs_dim=obs, action_dim=action, normalize="entry"
+            )
+
+
+def test_the_beliefs_on_disk_are_found():
+    assert {"drbpn", "gru", "gru_action", "fill", "none", "dvrl", "transformer"} <= set(BELIEFS)
+
+
+@pytest.mark.parametrize("belief", BELIEFS)
+def test_its_settings_stand_in_its_entry_and_none_in_the_code(belief):
+    entry = settings_of(belief)
+    assert entry["name"] == belief
+    module, _, function = entry["_target_"].rpartition(".")
+    parameters = inspect.signature(getattr(import_module(module), function)).parameters
+    assert all(p.default is inspect.Parameter.empty for p in parameters.values())
+    given = {"obs_dim", "action_dim", "normalize"}
+    assert set(parameters) - given == set(entry) - {"_target_", "name"}
+    with pytest.raises(UserError, match=f"`belief={belief}`: .*colour"):
+        build_belief({**entry, "colour": "red"}, obs_dim=3, action_dim=1, normalize="entry")
+
+
+@pytest.mark.parametrize("belief", BELIEFS)
+def test_a_run_learns_and_goes_on_from_its_files_to_the_last_bit(belief):
+    settings = read_settings(make_config("experiment=smoke", f"belief={belief}"))
+    with torch.random.fork_rng():
+        whole = assemble(settings)
+        start = [p.detach().clone() for p in whole.agent.parameters()]
+        train_rollout(whole, settings)
+        state = saved(training_state(whole))
+        row, _ = train_rollout(whole, settings)
+        expected = saved(training_state(whole))
+        resumed = assemble(settings)
+        restore(resumed, state, "here")
+        train_rollout(resumed, settings)
+        received = saved(training_state(resumed))
+    assert differences(expected, received) == []
+    columns = metric_columns(whole)
+    assert len(set(columns)) == len(columns)
+    assert row.keys() <= set(columns) | {"entropy", "max_ratio", "mean_ratio"}
+    numbers = [value for value in row.values() if value is not None]
+    assert torch.tensor(numbers, dtype=torch.float64).isfinite().all()
+    for old, new in zip(start, whole.agent.parameters(), strict=True):
+        assert not torch.equal(old, new)
