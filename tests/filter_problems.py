@@ -25,10 +25,12 @@ SIZES = [
 FORMS = [
     pytest.param("innovation", False, id="innovation, diagonal R"),
     pytest.param("innovation", True, id="innovation, full R"),
+    pytest.param("native", False, id="native, diagonal R"),
+    pytest.param("native", True, id="native, full R"),
     pytest.param("information", False, id="information, diagonal R"),
     pytest.param("loop", True, id="loop, full R"),
 ]
-FAST = ["innovation", "information"]
+FAST = ["innovation", "native", "information"]
 TOLERANCE = 1e-10
 
 

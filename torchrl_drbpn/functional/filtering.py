@@ -1,9 +1,10 @@
 """A whole sequence through the belief filter: fast forms, and the generic loop behind them.
 
-Three ways give the same numbers; :func:`filter_sequence` chooses:
+Four ways give the same numbers; :func:`filter_sequence` chooses:
 
 - *innovation form* (constant Q): factorises obs x obs, A = M (H Q H' + R) M' for every mask of the
   minibatch in one batched call; any R;
+- *native*: the innovation form in C (:mod:`.native`), where a C compiler is found, on the CPU;
 - *information form* (constant Q, diagonal R): factorises state x state,
   inv(cov) = inv(Q) + sum_i m_i / r_i h_i h_i'; the cheaper one where obs exceeds state;
 - *loop*: :mod:`.kalman` at every step, for any transition and for a Q that depends on the state.
@@ -31,6 +32,7 @@ from torchrl_drbpn.functional.model import (
     initial_belief,
     predict_step,
 )
+from torchrl_drbpn.functional.native import NativeRecurrence, native_refusal
 from torchrl_drbpn.functional.recurrence import (
     InformationRecurrence,
     InnovationRecurrence,
@@ -212,15 +214,15 @@ def filter_sequence(
             ``restart_mean`` instead of from the sequence.
         restart_mean: shape ``(*batch, time, state)``; read where ``restart`` is True.
         return_cov: whether the filtered covariances are wanted.
-        form: "auto" chooses by dimension (:func:`choose_form`); "innovation", "information" and
-            "loop" force one.
+        form: "auto" chooses by dimension (:func:`choose_form`), and the C form of the innovation
+            form where it runs; "innovation", "native", "information" and "loop" force one.
 
     Returns:
         :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
 
     Raises:
-        ValueError: if the asked form does not fit the model, or one of ``restart`` and
-            ``restart_mean`` is given without the other.
+        ValueError: if the asked form does not fit the model or the machine, or one of ``restart``
+            and ``restart_mean`` is given without the other.
 
     Example:
         >>> import torch
@@ -243,6 +245,18 @@ def filter_sequence(
         )
     batch, time = reset.shape[:-1], reset.shape[-1]
     mean = mean.expand(*batch, mean.shape[-1])
+
+    if chosen == "native" or (chosen == "innovation" and form == "auto"):
+        refusal = native_refusal(model, mean, previous_action, observation, restart_mean)
+        if refusal is None:
+            filtered, ll = _native(
+                model, mean, previous_action, observation, observed, reset, restart, restart_mean
+            )
+            return FilterOutput(
+                filtered, filtered_cov(model, observed, reset) if return_cov else None, ll
+            )
+        if chosen == "native":
+            raise ValueError(f"`form` 'native' cannot run here: {refusal}. Use form='auto'.")
 
     def time_major(x: Tensor) -> Tensor:
         """[*batch, time, dim] -> [time, batch, dim]."""
@@ -296,6 +310,43 @@ def _loop(
         means.append(mean)
         covs.append(filtered.cov)
     return torch.stack(means), torch.stack(covs), torch.stack(lls)
+
+
+def _native(
+    model: StateSpace,
+    start: Tensor,
+    action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    restart: Tensor | None,
+    stored: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    f, dtype, (*batch, time) = model.transition, start.dtype, reset.shape
+    assert isinstance(f, MeanNetwork)  # choose_form saw to it; for the type checker
+    # As in _for_innovation; here the whole filter is float64 then.
+    obs, state = model.emission_matrix.shape
+    wide = torch.float64 if obs > state else dtype
+
+    def rows(x: Tensor | None) -> Tensor | None:
+        return None if x is None else x.reshape(-1, *x.shape[len(batch) :]).contiguous()
+
+    start, observation, action = (
+        x.to(wide) for x in (start.reshape(-1, state), observation, action)
+    )
+    stored = None if stored is None else stored.to(wide)
+    parameters = (
+        constant_cov(model), model.initial_cov, model.emission_cov, model.emission_matrix,
+        model.action_matrix, model.emission_offset, model.initial_mean,
+        *(p for pair in zip(f.weights, f.biases, strict=True) for p in pair),
+    )  # fmt: skip
+    mean, ll = NativeRecurrence.apply(  # type: ignore[no-untyped-call]
+        f.residual, f.activation,
+        *map(rows, (observation, observed, action, reset, restart, stored)),
+        start if start.stride(-1) == 1 else start.contiguous(),
+        *(x.to(wide).contiguous() for x in parameters),
+    )  # fmt: skip
+    return mean.view(*batch, time, state).to(dtype), ll.view(*batch, time).to(dtype)
 
 
 def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, list[Tensor]]:

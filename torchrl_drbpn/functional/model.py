@@ -13,7 +13,7 @@ from torchrl_drbpn.functional.recurrence import MeanNetwork
 
 __all__ = ["Form", "StateSpace", "choose_form", "constant_cov", "predict_step"]
 
-Form = Literal["auto", "innovation", "information", "loop"]
+Form = Literal["auto", "innovation", "information", "native", "loop"]
 
 
 class StateSpace(NamedTuple):
@@ -102,9 +102,9 @@ def checked_form(model: StateSpace, form: Form) -> str:
     best = choose_form(model)
     if form == "auto":
         return best
-    if form not in ("innovation", "information", "loop"):
+    if form not in ("innovation", "information", "native", "loop"):
         raise ValueError(
-            f"`form` must be 'auto', 'innovation', 'information' or 'loop', got {form!r}."
+            f"`form` must be 'auto', 'innovation', 'information', 'native' or 'loop', got {form!r}."
         )
     if best == "loop" and form != "loop":
         raise ValueError(

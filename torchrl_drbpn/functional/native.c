@@ -1,0 +1,519 @@
+/* The belief filter over [batch, time] and its reverse pass as two functions: innovation form with
+ * constant Q, eq. (8), (10), (12) [DRBPN]. The same sums as recurrence.py, where PyTorch needs some
+ * hundred small operations a minibatch. native.py compiles this file, once for each `real`.
+ *
+ * Inside, row r = t * batch + b is step t of sequence b, and every row of a matrix is padded with
+ * zeros to whole vectors (capitals: N, S, J are obs, state, state + action, padded). What differs
+ * from step to step, the innovation covariance of each mask, is factorised for LANES rows at once:
+ * entry (i, j) of LANES matrices is one vector, so the textbook loops are the vectorised ones.
+ */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#ifndef REAL
+#define REAL float
+#endif
+typedef REAL real;
+#define BYTES 64
+#define LANES ((long)(BYTES / sizeof(real)))
+#define MAX_LAYERS 16
+typedef real vec __attribute__((vector_size(BYTES), aligned(sizeof(real)), may_alias));
+#define LOG_2PI ((real)1.8378770664093453)
+#define INLINE static inline __attribute__((always_inline))
+
+INLINE long padded(long n) { return (n + LANES - 1) / LANES * LANES; }
+
+/* ---------------------------------------------------------------- matrix products */
+
+/* C (+)= A B for ROWS x (COLS * LANES) entries of C, which stay in registers. */
+INLINE void tile(const int rows, const int cols, long inner, const real *A, long a_row, long a_in,
+                 const real *B, long ldb, real *C, long ldc, real sign, int add) {
+    vec acc[4][2];
+#pragma GCC unroll 4
+    for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+        for (int c = 0; c < cols; c++) acc[r][c] = (vec){0};
+    for (long k = 0; k < inner; k++) {
+        vec b[2];
+#pragma GCC unroll 2
+        for (int c = 0; c < cols; c++) b[c] = *(const vec *)(B + k * ldb + c * LANES);
+#pragma GCC unroll 4
+        for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+            for (int c = 0; c < cols; c++) acc[r][c] += A[r * a_row + k * a_in] * b[c];
+    }
+#pragma GCC unroll 4
+    for (int r = 0; r < rows; r++)
+#pragma GCC unroll 2
+        for (int c = 0; c < cols; c++) {
+            vec *to = (vec *)(C + r * ldc + c * LANES);
+            *to = add ? *to + sign * acc[r][c] : sign * acc[r][c];
+        }
+}
+
+/* C[m][n] = (add ? C[m][n] : 0) + sign * sum_k A[m a_row + k a_in] B[k ldb + n]; n padded. */
+static void product(long m, long n, long inner, const real *A, long a_row, long a_in, const real *B,
+                    long ldb, real *C, long ldc, real sign, int add) {
+    for (long j = 0; j < n;) {
+        long wide = n - j >= 2 * LANES, i = 0;
+        for (; i + 4 <= m; i += 4) {
+            const real *a = A + i * a_row;
+            if (wide) tile(4, 2, inner, a, a_row, a_in, B + j, ldb, C + i * ldc + j, ldc, sign, add);
+            else tile(4, 1, inner, a, a_row, a_in, B + j, ldb, C + i * ldc + j, ldc, sign, add);
+        }
+        for (; i < m; i++) {
+            const real *a = A + i * a_row;
+            if (wide) tile(1, 2, inner, a, a_row, a_in, B + j, ldb, C + i * ldc + j, ldc, sign, add);
+            else tile(1, 1, inner, a, a_row, a_in, B + j, ldb, C + i * ldc + j, ldc, sign, add);
+        }
+        j += wide ? 2 * LANES : LANES;
+    }
+}
+
+/* to[r][c] = from[r * row + c * col], columns from `cols` to `ld` zero. */
+static void pack(long rows, long cols, const real *from, long row, long col, real *to, long ld) {
+    for (long r = 0; r < rows; r++) {
+        for (long c = 0; c < cols; c++) to[r * ld + c] = from[r * row + c * col];
+        for (long c = cols; c < ld; c++) to[r * ld + c] = 0;
+    }
+}
+
+static void unpack(long rows, long cols, const real *from, long ld, real *to) {
+    for (long r = 0; r < rows; r++) memcpy(to + r * cols, from + r * ld, cols * sizeof(real));
+}
+
+/* ---------------------------------------------------------------- sizes and memory */
+
+typedef struct {
+    long batch, time, obs, state, action, layers, residual, relu, full_noise, start_stride;
+    long width[MAX_LAYERS + 1], W[MAX_LAYERS + 1]; /* of layer outputs; 0: (state, action) */
+    long N, S, J, rows, groups;
+} Sizes;
+
+static Sizes read_sizes(const int64_t *d) {
+    Sizes z = {d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9]};
+    z.width[0] = z.state + z.action;
+    for (long i = 1; i <= z.layers; i++) z.width[i] = d[9 + i];
+    for (long i = 0; i <= z.layers; i++) z.W[i] = padded(z.width[i]);
+    z.N = padded(z.obs), z.S = padded(z.state), z.J = z.W[0];
+    z.rows = z.batch * z.time, z.groups = (z.rows + LANES - 1) / LANES;
+    return z;
+}
+
+typedef struct { real *base; long used; } Memory;
+
+static real *take(Memory *m, long count) {
+    long at = m->used;
+    m->used += padded(count);
+    return m->base ? m->base + at : 0;
+}
+
+typedef struct { /* what the reverse pass reads, all but inverse as [rows][padded] */
+    real *input, *predicted, *hidden[MAX_LAYERS], *z, *inverse, *cross[2], *cross_t[2];
+} Tape;
+
+static Tape lay_tape(const Sizes *s, Memory *m) {
+    Tape t;
+    t.input = take(m, s->rows * s->J), t.predicted = take(m, s->rows * s->J);
+    for (long i = 1; i < s->layers; i++) t.hidden[i] = take(m, s->rows * s->W[i]);
+    t.z = take(m, s->rows * s->N);
+    t.inverse = take(m, s->groups * s->obs * s->obs * LANES);
+    for (int k = 0; k < 2; k++) {
+        t.cross[k] = take(m, s->state * s->N);
+        t.cross_t[k] = take(m, s->obs * s->S);
+    }
+    return t;
+}
+
+typedef struct {
+    real *weight_t[MAX_LAYERS + 1], *bias[MAX_LAYERS + 1], *sensor_t, *offset, *cov[2], *factor,
+        *lower, *error, *error_lanes, *log_det, *mean, *step;
+} Ahead;
+
+static Ahead lay_ahead(const Sizes *s, Memory *m) {
+    Ahead a;
+    for (long i = 1; i <= s->layers; i++) {
+        a.weight_t[i] = take(m, s->width[i - 1] * s->W[i]);
+        a.bias[i] = take(m, s->W[i]);
+    }
+    a.sensor_t = take(m, s->width[0] * s->N), a.offset = take(m, s->N);
+    a.cov[0] = take(m, s->obs * s->N), a.cov[1] = take(m, s->obs * s->N);
+    a.factor = take(m, s->obs * s->obs * LANES), a.lower = take(m, s->obs * s->obs * LANES);
+    a.error = take(m, s->batch * s->N), a.error_lanes = take(m, s->obs * LANES);
+    a.log_det = take(m, s->groups * LANES);
+    a.mean = take(m, s->batch * s->S), a.step = take(m, s->batch * s->S);
+    return a;
+}
+
+typedef struct {
+    real *weight[MAX_LAYERS + 1], *layer[MAX_LAYERS + 1], *sensor, *noise_prior[2], *filtered,
+        *error, *left, *half, *lanes, *sum, *carry, *by_predicted, *by_input, *cross[2], *cov[2],
+        *square, *wide;
+} Back;
+
+static Back lay_back(const Sizes *s, Memory *m) {
+    Back b;
+    long widest = s->J > s->N ? s->J : s->N;
+    for (long i = 1; i <= s->layers; i++) {
+        b.weight[i] = take(m, s->width[i] * s->W[i - 1]);
+        b.layer[i] = take(m, s->rows * s->W[i]);
+        widest = s->W[i] > widest ? s->W[i] : widest;
+    }
+    b.sensor = take(m, s->obs * s->J);
+    b.filtered = take(m, s->rows * s->S), b.error = take(m, s->rows * s->N);
+    b.left = take(m, s->rows * s->N), b.half = take(m, s->groups * LANES);
+    b.lanes = take(m, s->obs * LANES), b.sum = take(m, s->obs * s->obs * LANES);
+    b.carry = take(m, s->batch * s->S);
+    b.by_predicted = take(m, s->batch * s->J), b.by_input = take(m, s->batch * s->J);
+    for (int k = 0; k < 2; k++) {
+        b.noise_prior[k] = take(m, s->state * s->S);
+        b.cross[k] = take(m, s->state * s->N), b.cov[k] = take(m, s->obs * s->N);
+    }
+    b.square = take(m, s->obs * s->N);
+    b.wide = take(m, widest * widest);
+    return b;
+}
+
+/* Reals that the caller allocates: tape, scratch of forward, scratch of backward. */
+void sizes(const int64_t *dims, int64_t *out) {
+    Sizes s = read_sizes(dims);
+    Memory tape = {0}, ahead = {0}, back = {0};
+    lay_tape(&s, &tape), lay_ahead(&s, &ahead), lay_back(&s, &back);
+    out[0] = tape.used, out[1] = ahead.used, out[2] = back.used;
+}
+
+/* ---------------------------------------------------------------- the innovation covariances */
+
+/* Factorise and invert M (H P H' + R) M' of LANES rows; a row that fails becomes NaN alone. */
+static void invert(const Sizes *s, const Ahead *a, long group, const uint8_t *observed,
+                   const uint8_t *reset, real *inverse, real *log_det) {
+    long n = s->obs;
+    vec mask[n], again = {0}, pivot[n];
+    vec *L = (vec *)a->factor, *X = (vec *)a->lower, *I = (vec *)inverse;
+    for (long l = 0; l < LANES; l++) {
+        long r = group * LANES + l < s->rows ? group * LANES + l : s->rows - 1;
+        long from = (r % s->batch) * s->time + r / s->batch;
+        again[l] = reset[from];
+        for (long i = 0; i < n; i++) mask[i][l] = observed[from * n + i];
+    }
+    vec det = {0};
+    for (long i = 0; i < n; i++)
+        for (long j = 0; j <= i; j++) {
+            /* Weights of exactly 0 or 1 choose exactly. */
+            vec c = (1 - again) * a->cov[0][i * s->N + j] + again * a->cov[1][i * s->N + j];
+            c *= mask[i] * mask[j];
+            if (i == j) c += 1 - mask[i];
+            for (long k = 0; k < j; k++) c -= L[i * n + k] * L[j * n + k];
+            if (i > j) {
+                L[i * n + j] = c * pivot[j];
+                continue;
+            }
+            for (long l = 0; l < LANES; l++) c[l] = sizeof(real) == 4 ? sqrtf(c[l]) : sqrt(c[l]);
+            L[i * n + i] = c, pivot[i] = 1 / c;
+            for (long l = 0; l < LANES; l++)
+                det[l] += 2 * (sizeof(real) == 4 ? logf(c[l]) : log(c[l]));
+        }
+    memcpy(log_det, &det, sizeof det);
+    for (long j = 0; j < n; j++) { /* X = inv(L) */
+        X[j * n + j] = pivot[j];
+        for (long i = j + 1; i < n; i++) {
+            vec c = {0};
+            for (long k = j; k < i; k++) c -= L[i * n + k] * X[k * n + j];
+            X[i * n + j] = c * pivot[i];
+        }
+    }
+    for (long i = 0; i < n; i++)
+        for (long j = 0; j <= i; j++) { /* X' X, only where observed */
+            vec c = {0};
+            for (long k = i; k < n; k++) c += X[k * n + i] * X[k * n + j];
+            I[i * n + j] = I[j * n + i] = c * mask[i] * mask[j];
+        }
+}
+
+/* out[r] = inverse_r in[r] for the rows of one step; `in` starts at its first row. */
+static void solve(const Sizes *s, long t, const real *inverse, const real *in, real *lanes,
+                  real *out) {
+    long n = s->obs, first = t * s->batch, last = first + s->batch;
+    vec *e = (vec *)lanes;
+    for (long group = first / LANES; group * LANES < last; group++) {
+        long low = group * LANES > first ? group * LANES : first;
+        long high = (group + 1) * LANES < last ? (group + 1) * LANES : last;
+        if (high - low < LANES) memset(lanes, 0, n * BYTES);
+        for (long r = low; r < high; r++)
+            for (long i = 0; i < n; i++) lanes[i * LANES + r % LANES] = in[(r - first) * s->N + i];
+        const vec *I = (const vec *)inverse + group * n * n;
+        for (long i = 0; i < n; i++) {
+            vec c = {0}, c2 = {0};
+            long j = 0;
+            for (; j + 1 < n; j += 2) c += I[i * n + j] * e[j], c2 += I[i * n + j + 1] * e[j + 1];
+            if (j < n) c += I[i * n + j] * e[j];
+            c += c2;
+            for (long r = low; r < high; r++) out[r * s->N + i] = c[r % LANES];
+        }
+    }
+}
+
+/* ---------------------------------------------------------------- forward */
+
+void forward(const int64_t *dims, void **p) {
+    Sizes z = read_sizes(dims), *s = &z;
+    const real *x = p[0], *action = p[2], *stored = p[5], *start = p[6], *cov[2] = {p[7], p[8]};
+    const real *noise = p[9], *H = p[10], *B = p[11], *d = p[12], *initial = p[13];
+    const uint8_t *observed = p[1], *reset = p[3], *restart = p[4];
+    real *mean = p[14], *ll = p[15];
+    Memory kept = {p[16], 0}, scratch = {p[17], 0};
+    Tape tape = lay_tape(s, &kept);
+    Ahead a = lay_ahead(s, &scratch);
+    long n = s->obs, m = s->state, width = s->width[0], N = s->N, S = s->S, J = s->J;
+    long batch = s->batch, time = s->time;
+
+    for (long i = 1; i <= s->layers; i++) {
+        const real *weight = p[16 + 2 * i], *bias = p[17 + 2 * i];
+        pack(s->width[i - 1], s->width[i], weight, 1, s->width[i - 1], a.weight_t[i], s->W[i]);
+        pack(1, s->width[i], bias, 0, 1, a.bias[i], s->W[i]);
+    }
+    pack(m, n, H, 1, m, a.sensor_t, N);
+    pack(s->action, n, B, 1, s->action, a.sensor_t + m * N, N);
+    pack(1, n, d, 0, 1, a.offset, N);
+    for (int k = 0; k < 2; k++) { /* P H' and H P H' + R, P = Q or initial_cov */
+        product(m, N, m, cov[k], m, 1, a.sensor_t, N, tape.cross[k], N, 1, 0);
+        pack(n, m, tape.cross[k], 1, N, tape.cross_t[k], S);
+        if (s->full_noise) pack(n, n, noise, n, 1, a.cov[k], N);
+        else {
+            memset(a.cov[k], 0, n * N * sizeof(real));
+            for (long i = 0; i < n; i++) a.cov[k][i * N + i] = noise[i];
+        }
+        product(n, N, m, H, m, 1, tape.cross[k], N, a.cov[k], N, 1, 1);
+    }
+    for (long g = 0; g < s->groups; g++)
+        invert(s, &a, g, observed, reset, tape.inverse + g * n * n * LANES, a.log_det + g * LANES);
+
+    for (long t = 0; t < time; t++) {
+        long row = t * batch;
+        real *input = tape.input + row * J, *predicted = tape.predicted + row * J;
+        for (long b = 0; b < batch; b++) {
+            const real *from = a.mean + b * S;
+            if (t == 0) from = start + b * s->start_stride;
+            if (restart && restart[b * time + t]) from = stored + (b * time + t) * m;
+            memcpy(input + b * J, from, m * sizeof(real));
+            const real *moved = action + (b * time + t) * s->action;
+            memcpy(input + b * J + m, moved, s->action * sizeof(real));
+            memset(input + b * J + width, 0, (J - width) * sizeof(real));
+            memcpy(predicted + b * J, input + b * J, J * sizeof(real));
+        }
+        const real *h = input;
+        for (long i = 1; i <= s->layers; i++) {
+            long wide = s->W[i];
+            real *out = i < s->layers ? tape.hidden[i] + row * wide : a.step;
+            for (long b = 0; b < batch; b++) memcpy(out + b * wide, a.bias[i], wide * sizeof(real));
+            product(batch, wide, s->width[i - 1], h, s->W[i - 1], 1, a.weight_t[i], wide, out, wide,
+                    1, 1);
+            if (i < s->layers) {
+                if (s->relu) for (long k = 0; k < batch * wide; k++) out[k] = out[k] < 0 ? 0 : out[k];
+                else for (long k = 0; k < batch * wide; k++) out[k] = tanh(out[k]);
+            }
+            h = out;
+        }
+        for (long b = 0; b < batch; b++) {
+            real *to = predicted + b * J, *out = a.mean + b * S, *e = a.error + b * N;
+            for (long i = 0; i < m; i++) {
+                real moved = a.step[b * S + i] + (s->residual ? input[b * J + i] : 0);
+                to[i] = out[i] = reset[b * time + t] ? initial[i] : moved;
+            }
+            memcpy(e, a.offset, N * sizeof(real));
+        }
+        product(batch, N, width, predicted, J, 1, a.sensor_t, N, a.error, N, 1, 1);
+        for (long b = 0; b < batch; b++) {
+            long at = (b * time + t) * n;
+            real *e = a.error + b * N;
+            for (long i = 0; i < n; i++) e[i] = observed[at + i] ? x[at + i] - e[i] : 0;
+        }
+        real *gained = tape.z + row * N;
+        solve(s, t, tape.inverse, a.error, a.error_lanes, tape.z);
+        /* a.mean holds the predicted mean: add P H' z, of the P that the row started from */
+        for (long b = 0; b < batch; b++) {
+            real *at = gained + b * N;
+            for (long i = n; i < N; i++) at[i] = 0;
+        }
+        for (long b = 0; b < batch;) {
+            long first = b, k = reset[b * time + t] != 0;
+            while (b < batch && (reset[b * time + t] != 0) == k) b++;
+            product(b - first, S, n, gained + first * N, N, 1, tape.cross_t[k], S,
+                    a.mean + first * S, S, 1, 1);
+        }
+        for (long b = 0; b < batch; b++) {
+            long at = b * time + t, count = 0;
+            real quadratic = 0;
+            for (long i = 0; i < n; i++) {
+                quadratic += gained[b * N + i] * a.error[b * N + i];
+                count += observed[at * n + i];
+            }
+            ll[at] = count ? (real)-0.5 * (quadratic + a.log_det[row + b] + count * LOG_2PI) : 0;
+            memcpy(mean + at * m, a.mean + b * S, m * sizeof(real));
+        }
+    }
+}
+
+/* ---------------------------------------------------------------- backward */
+
+static void add_outer(long rows, long cols, const real *left, const real *right, real *to, long ld) {
+    for (long i = 0; i < rows; i++)
+        for (long j = 0; j < cols; j++) to[i * ld + j] += left[i] * right[j];
+}
+
+void backward(const int64_t *dims, void **p) {
+    Sizes z = read_sizes(dims), *s = &z;
+    const real *g_mean = p[0], *g_ll = p[1], *cov[2] = {p[4], p[5]}, *H = p[6], *B = p[7];
+    const uint8_t *reset = p[2], *restart = p[3];
+    Memory kept = {p[8], 0}, scratch = {p[9], 0};
+    real *g_x = p[10], *g_action = p[11], *g_stored = p[12], *g_start = p[13];
+    real *g_cov[2] = {p[14], p[15]}, *g_noise = p[16], *g_H = p[17], *g_B = p[18], *g_d = p[19];
+    real *g_initial = p[20];
+    Tape tape = lay_tape(s, &kept);
+    Back w = lay_back(s, &scratch);
+    long n = s->obs, m = s->state, width = s->width[0], N = s->N, S = s->S, J = s->J;
+    long batch = s->batch, time = s->time, last = s->layers;
+
+    for (long i = 1; i <= last; i++)
+        pack(s->width[i], s->width[i - 1], p[20 + i], s->width[i - 1], 1, w.weight[i], s->W[i - 1]);
+    pack(n, m, H, m, 1, w.sensor, J);
+    for (long i = 0; i < n; i++) {
+        memcpy(w.sensor + i * J + m, B + i * s->action, s->action * sizeof(real));
+        memset(w.sensor + i * J + width, 0, (J - width) * sizeof(real));
+    }
+    for (int k = 0; k < 2; k++) {
+        memset(w.cross[k], 0, m * N * sizeof(real));
+        memset(w.cov[k], 0, n * N * sizeof(real));
+    }
+    memset(w.carry, 0, batch * S * sizeof(real));
+    memset(w.half, 0, s->groups * BYTES);
+    memset(w.sum, 0, n * n * BYTES);
+    memset(g_initial, 0, m * sizeof(real));
+
+    for (long t = time - 1; t >= 0; t--) {
+        long row = t * batch;
+        real *g = w.filtered + row * S, *u = w.left + row * N, *ge = w.error + row * N;
+        real *top = w.layer[last] + row * S;
+        for (long b = 0; b < batch; b++) {
+            const real *outer = g_mean ? g_mean + (b * time + t) * m : 0;
+            for (long i = 0; i < S; i++)
+                g[b * S + i] = w.carry[b * S + i] + (outer && i < m ? outer[i] : 0);
+        }
+        /* ge, by the innovation: A^-1 (P H')' g through the gain, -g_ll z from the likelihood */
+        for (long b = 0; b < batch;) {
+            long first = b, k = reset[b * time + t] != 0;
+            while (b < batch && (reset[b * time + t] != 0) == k) b++;
+            product(b - first, N, m, g + first * S, S, 1, tape.cross[k], N, u + first * N, N, 1, 0);
+        }
+        solve(s, t, tape.inverse, u, w.lanes, w.error);
+        memset(w.by_predicted, 0, batch * J * sizeof(real));
+        for (long b = 0; b < batch; b++) {
+            long at = b * time + t, again = reset[at] != 0;
+            real by = g_ll ? g_ll[at] : 0, half = (real)0.5 * by;
+            real *e = ge + b * N, *left = u + b * N, *zb = tape.z + (row + b) * N;
+            for (long i = n; i < N; i++) e[i] = 0;
+            for (long i = 0; i < n; i++) e[i] -= by * zb[i];
+            /* by A: (left z' + z left')/2 - half A^-1, summed over ordinary steps after the loop */
+            for (long i = 0; i < N; i++) left[i] = -(e[i] + half * zb[i]);
+            if (again) {
+                const real *inverse = tape.inverse + (row + b) / LANES * n * n * LANES;
+                add_outer(n, n, left, zb, w.cov[1], N);
+                for (long i = 0; i < n * n; i++)
+                    w.cov[1][i / n * N + i % n] -= half * inverse[i * LANES + (row + b) % LANES];
+                add_outer(m, n, g + b * S, zb, w.cross[1], N);
+                memset(left, 0, N * sizeof(real));
+            } else {
+                w.half[row + b] = half;
+            }
+            memcpy(w.by_predicted + b * J, g + b * S, m * sizeof(real));
+            if (again) memset(g + b * S, 0, S * sizeof(real));
+        }
+        product(batch, J, n, ge, N, 1, w.sensor, J, w.by_predicted, J, -1, 1);
+        for (long b = 0; b < batch; b++) {
+            real *by = w.by_predicted + b * J;
+            int again = reset[b * time + t] != 0;
+            for (long i = 0; i < S; i++) top[b * S + i] = i < m && !again ? by[i] : 0;
+            if (again) for (long i = 0; i < m; i++) g_initial[i] += by[i];
+        }
+        for (long i = last; i > 1; i--) {
+            long wide = s->W[i - 1];
+            real *to = w.layer[i - 1] + row * wide, *h = tape.hidden[i - 1] + row * wide;
+            product(batch, wide, s->width[i], w.layer[i] + row * s->W[i], s->W[i], 1, w.weight[i],
+                    wide, to, wide, 1, 0);
+            if (s->relu) for (long k = 0; k < batch * wide; k++) to[k] = h[k] <= 0 ? 0 : to[k];
+            else for (long k = 0; k < batch * wide; k++) to[k] *= 1 - h[k] * h[k];
+        }
+        product(batch, J, s->width[1], w.layer[1] + row * s->W[1], s->W[1], 1, w.weight[1], J,
+                w.by_input, J, 1, 0);
+        for (long b = 0; b < batch; b++) {
+            long at = b * time + t;
+            real *by = w.by_input + b * J, *carry = w.carry + b * S;
+            if (s->residual) for (long i = 0; i < m; i++) by[i] += top[b * S + i];
+            int again = restart && restart[at];
+            for (long i = 0; i < m; i++) carry[i] = again ? 0 : by[i];
+            if (g_stored)
+                for (long i = 0; i < m; i++) g_stored[at * m + i] = again ? by[i] : 0;
+            if (g_action)
+                for (long i = 0; i < s->action; i++)
+                    g_action[at * s->action + i] = by[m + i] + w.by_predicted[b * J + m + i];
+            if (g_x) memcpy(g_x + at * n, ge + b * N, n * sizeof(real));
+        }
+    }
+    if (g_start) unpack(batch, m, w.carry, S, g_start);
+
+    for (long i = 1; i <= last; i++) {
+        const real *in = i == 1 ? tape.input : tape.hidden[i - 1];
+        real *by_weight = p[20 + last + 2 * i - 1], *by_bias = p[20 + last + 2 * i];
+        long wide = s->W[i - 1];
+        product(s->width[i], wide, s->rows, w.layer[i], 1, s->W[i], in, wide, w.wide, wide, 1, 0);
+        unpack(s->width[i], s->width[i - 1], w.wide, wide, by_weight);
+        memset(by_bias, 0, s->width[i] * sizeof(real));
+        for (long r = 0; r < s->rows; r++)
+            for (long k = 0; k < s->width[i]; k++) by_bias[k] += w.layer[i][r * s->W[i] + k];
+    }
+    product(n, J, s->rows, w.error, 1, N, tape.predicted, J, w.wide, J, -1, 0);
+    unpack(n, m, w.wide, J, g_H);
+    for (long i = 0; i < n; i++)
+        memcpy(g_B + i * s->action, w.wide + i * J + m, s->action * sizeof(real));
+    memset(g_d, 0, n * sizeof(real));
+    for (long r = 0; r < s->rows; r++)
+        for (long i = 0; i < n; i++) g_d[i] -= w.error[r * N + i];
+
+    product(m, N, s->rows, w.filtered, 1, S, tape.z, N, w.cross[0], N, 1, 0);
+    product(n, N, s->rows, w.left, 1, N, tape.z, N, w.cov[0], N, 1, 0);
+    vec *sum = (vec *)w.sum;
+    for (long g = 0; g < s->groups; g++) {
+        vec half = *(vec *)(w.half + g * LANES);
+        const vec *I = (const vec *)tape.inverse + g * n * n;
+        for (long i = 0; i < n * n; i++) sum[i] += half * I[i];
+    }
+    for (long i = 0; i < n; i++)
+        for (long j = 0; j < n; j++) {
+            real total = 0;
+            for (long l = 0; l < LANES; l++) total += sum[i * n + j][l];
+            w.cov[0][i * N + j] -= total;
+        }
+
+    /* A = H C + R with C = P H': on to R, C, H and P */
+    memset(g_noise, 0, (s->full_noise ? n * n : n) * sizeof(real));
+    pack(n, m, H, m, 1, w.sensor, S); /* J is at least S */
+    for (int k = 0; k < 2; k++) {
+        for (long i = 0; i < n; i++)
+            for (long j = 0; j < N; j++)
+                w.square[i * N + j] =
+                    j < n ? (real)0.5 * (w.cov[k][i * N + j] + w.cov[k][j * N + i]) : 0;
+        for (long i = 0; i < n; i++) {
+            if (!s->full_noise) g_noise[i] += w.square[i * N + i];
+            else for (long j = 0; j < n; j++) g_noise[i * n + j] += w.square[i * N + j];
+        }
+        product(m, N, n, H, 1, m, w.square, N, w.cross[k], N, 1, 1);
+        product(m, S, n, w.cross[k], N, 1, w.sensor, S, w.wide, S, 1, 0);
+        unpack(m, m, w.wide, S, g_cov[k]);
+        pack(m, m, cov[k], m, 1, w.noise_prior[k], S);
+        product(n, S, n, w.square, N, 1, tape.cross_t[k], S, w.wide, S, 1, 0);
+        product(n, S, m, w.cross[k], 1, N, w.noise_prior[k], S, w.wide, S, 1, 1);
+        for (long i = 0; i < n; i++)
+            for (long j = 0; j < m; j++) g_H[i * m + j] += w.wide[i * S + j];
+    }
+}

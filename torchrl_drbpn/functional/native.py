@@ -1,0 +1,212 @@
+"""The innovation form in C: one call forward and one back, not some hundred operations each.
+
+At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
+time between the operations of the filter, not in them. ``native.c`` holds the same sums as
+:class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and is held to the same oracles.
+It is compiled once for a machine, when it is first used, by the C compiler found in ``CC`` or on
+the path, into the user's cache folder; where there is none, the PyTorch form runs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from torchrl_drbpn.functional.model import StateSpace
+from torchrl_drbpn.functional.recurrence import MeanNetwork
+
+__all__ = ["NativeRecurrence", "native_error", "native_refusal"]
+
+_SOURCE = Path(__file__).with_name("native.c")
+_REALS = {torch.float32: "float", torch.float64: "double"}
+# Vectors of the width that PyTorch found: the compiled file then runs wherever its name is equal.
+_MACHINE_FLAGS = {"AVX512": ["-march=x86-64-v4"], "AVX2": ["-march=x86-64-v3"]}
+# Without errno and traps roots and choices become vector instructions; sums keep their order.
+_FLAGS = ["-O3", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
+_MAX_OBS = 64  # the batched factorisation keeps a group of matrices in cache up to here
+_MAX_LAYERS = 15
+
+
+class NativeError(RuntimeError):
+    """Say why the C form cannot be had on this machine."""
+
+
+@functools.cache
+def _library(dtype: torch.dtype) -> ctypes.CDLL:
+    """Compile once, then load."""
+    if os.environ.get("TORCHRL_DRBPN_NATIVE", "1") == "0":
+        raise NativeError("TORCHRL_DRBPN_NATIVE=0 switches it off")
+    named = shlex.split(os.environ.get("CC", ""))
+    compiler = named or [next(filter(shutil.which, ("cc", "gcc", "clang")), "")]
+    if not compiler[0] or shutil.which(compiler[0]) is None:
+        raise NativeError("there is no C compiler: install gcc or clang, or name one in CC")
+    flags = [*_FLAGS, *_MACHINE_FLAGS.get(torch.backends.cpu.get_cpu_capability(), [])]
+    command = [*compiler, *flags, f"-DREAL={_REALS[dtype]}"]
+    text = "\n".join([*command, platform.machine(), _SOURCE.read_text(encoding="utf-8")])
+    name = f"native-{_REALS[dtype]}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.so"
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    path = Path(cache) / "torchrl_drbpn" / name
+    try:
+        if not path.is_file():
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+                built = Path(folder) / name
+                done = subprocess.run(
+                    [*command, "-o", str(built), str(_SOURCE), "-lm"],
+                    capture_output=True,
+                    text=True,
+                    check=False,
+                )
+                if done.returncode:
+                    reason = " ".join(done.stderr.split())[:300]
+                    raise NativeError(f"`{compiler[0]}` refused native.c: {reason}")
+                built.replace(path)  # whole or not at all, whoever else compiles it now
+        return ctypes.CDLL(str(path))
+    except OSError as error:
+        raise NativeError(f"it could not be built or loaded: {error}") from error
+
+
+@functools.cache
+def native_error(dtype: torch.dtype = torch.float32) -> str | None:
+    """Say why the C form cannot be had on this machine; compiles it where that is still to do.
+
+    Args:
+        dtype: of the filter's tensors.
+
+    Returns:
+        None where it can be had, else the reason.
+
+    Example:
+        >>> native_error(torch.float16)
+        'there is no C form for torch.float16'
+    """
+    if dtype not in _REALS:
+        return f"there is no C form for {dtype}"
+    try:
+        _library(dtype)
+    except NativeError as error:
+        return str(error)
+    return None
+
+
+def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
+    """Say why the C form does not take this model and these inputs.
+
+    Args:
+        model: a model that the innovation form takes.
+        tensors: the inputs of the filter that hold numbers.
+
+    Returns:
+        None where it takes them, else the reason.
+
+    Example:
+        >>> import torch
+        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...                    torch.zeros(2), eye)
+        >>> native_refusal(model, torch.zeros(2).double())
+        'the dtypes differ'
+    """
+    dtype = model.initial_mean.dtype
+    obs = len(model.emission_matrix)
+    assert isinstance(model.transition, MeanNetwork)  # as the innovation form demands
+    every = [*model.transition.weights, *model.transition.biases, *model[1:], *tensors]
+    given = [x for x in every if isinstance(x, Tensor)]
+    if torch.compiler.is_compiling():
+        return "torch.compile traces PyTorch's operations"
+    if any(x.device.type != "cpu" for x in given):
+        return "it runs on the CPU"
+    if any(x.dtype != dtype for x in given):
+        return "the dtypes differ"
+    if obs > _MAX_OBS:
+        return f"obs is {obs}, more than {_MAX_OBS}"
+    if len(model.transition.weights) > _MAX_LAYERS:
+        return f"the transition has more than {_MAX_LAYERS} layers"
+    return native_error(dtype)
+
+
+def _call(function: Any, dims: Any, tensors: list[Tensor | None]) -> None:
+    pointers = [None if x is None else x.data_ptr() for x in tensors]
+    function(dims, (ctypes.c_void_p * len(pointers))(*pointers))
+
+
+class NativeRecurrence(torch.autograd.Function):
+    """Filter mean and log-likelihood of whole sequences by ``native.c``, batch first.
+
+    Inputs: residual, activation, observation, observed, previous action, reset, restart, stored
+    mean, start, Q, initial covariance, R, H, B, d, initial mean, then the weight and the bias of
+    each layer. All contiguous, one dtype, on the CPU.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor]:
+        """Return filtered mean ``(batch, time, state)`` and log-likelihood ``(batch, time)``."""
+        residual, activation, x, observed, action, reset, restart, stored, start = args[:9]
+        Q, initial_cov, R, H, B, d, initial_mean, *layers = args[9:]
+        (batch, time, obs), state = x.shape, start.shape[-1]
+        widths = [weight.shape[0] for weight in layers[0::2]]
+        numbers = [
+            batch, time, obs, state, action.shape[-1], len(widths), residual, activation == "relu",
+            R.ndim == 2, start.stride(0), *widths,
+        ]  # fmt: skip
+        dims = (ctypes.c_int64 * len(numbers))(*numbers)
+        library = _library(x.dtype)
+        counts = (ctypes.c_int64 * 3)()
+        library.sizes(dims, counts)
+        tape, scratch = x.new_empty(counts[0]), x.new_empty(counts[1])
+        mean, ll = x.new_empty(batch, time, state), x.new_empty(batch, time)
+        _call(
+            library.forward,
+            dims,
+            [
+                x, observed, action, reset, restart, stored, start, Q, initial_cov, R, H, B, d,
+                initial_mean, mean, ll, tape, scratch, *layers,
+            ],
+        )  # fmt: skip
+        ctx.save_for_backward(reset, restart, Q, initial_cov, R, H, B, d, tape, *layers)
+        ctx.dims, ctx.shape, ctx.scratch = dims, (batch, time, obs, state), counts[2]
+        ctx.set_materialize_grads(False)
+        return mean, ll
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_mean: Tensor | None, g_ll: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Return the gradient of every input of ``forward``, in its order."""
+        reset, restart, Q, initial_cov, R, H, B, d, tape, *layers = ctx.saved_tensors
+        batch, time, obs, state = ctx.shape
+        wanted = ctx.needs_input_grad
+        g_x = tape.new_empty(batch, time, obs) if wanted[2] else None
+        g_action = tape.new_empty(batch, time, B.shape[-1]) if wanted[4] else None
+        g_stored = tape.new_empty(batch, time, state) if wanted[7] else None
+        g_start = tape.new_empty(batch, state) if wanted[8] else None
+        of_model = [torch.empty_like(v) for v in (Q, initial_cov, R, H, B, d)]
+        g_initial = tape.new_empty(state)
+        of_layers = [torch.empty_like(v) for v in layers]
+        _call(
+            _library(tape.dtype).backward,
+            ctx.dims,
+            [
+                None if g_mean is None else g_mean.contiguous(),
+                None if g_ll is None else g_ll.contiguous(),
+                reset, restart, Q, initial_cov, H, B, tape, tape.new_empty(ctx.scratch),
+                g_x, g_action, g_stored, g_start, *of_model, g_initial, *layers[0::2], *of_layers,
+            ],
+        )  # fmt: skip
+        return (
+            None, None, g_x, None, g_action, None, None, g_stored, g_start, *of_model, g_initial,
+            *of_layers,
+        )  # fmt: skip
