@@ -10,11 +10,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
-from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import ValueEstimators
 
+from torchrl_drbpn.objectives._clipped import plain_terms
 from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, last_steps
 
 __all__ = ["DRBPNLoss"]
@@ -224,7 +224,8 @@ class DRBPNLoss(LossModule):
         model = None if self.model_loss is None else self.model_loss(data)
         if self.detach_belief:
             data.set(keys.features, data.get(keys.features).detach())
-        out = self.ppo_loss(data)
+        terms = plain_terms(self.ppo_loss, data)
+        out = self.ppo_loss(data) if terms is None else TensorDict(terms)
         if model is not None:
             for name, value in model.items():
                 out.set(name, self.model_coeff * value if name == "loss_model" else value)
@@ -245,19 +246,21 @@ class DRBPNLoss(LossModule):
         )
         if not where[0].numel():
             return  # no row ends here; not every belief module takes an empty batch
-        gathered = TensorDict({}, batch_size=where[0].shape)
+        # As sequences of one step, which have the fast forms.
+        gathered = TensorDict({}, batch_size=[len(where[0]), 1])
         for key in self.filter_network.in_keys:
             following = data.get(("next", key), None)
             if following is not None and key != keys.is_init:
-                gathered.set(key, following[where])
+                gathered.set(key, following[where].unsqueeze(1))
         # A belief that goes on is what is wanted here.
         start = torch.zeros(*gathered.shape, 1, dtype=torch.bool, device=log_likelihood.device)
         gathered.set(keys.is_init, start)
-        with set_recurrent_mode(False):
-            self.filter_network(gathered)
+        self.filter_network(gathered)
         data.set(
             keys.next_log_likelihood,
-            torch.zeros_like(log_likelihood).index_put(where, gathered.get(keys.log_likelihood)),
+            torch.zeros_like(log_likelihood).index_put(
+                where, gathered.get(keys.log_likelihood).squeeze(1)
+            ),
         )
 
 

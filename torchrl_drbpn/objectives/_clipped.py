@@ -1,0 +1,126 @@
+"""The terms of a ClipPPOLoss on plain tensors, for the heads that nearly every agent has."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torchrl.modules import IndependentNormal
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.utils import distance_loss
+
+_LOG_2PI = math.log(2 * math.pi)
+
+
+class _ClippedGain(torch.autograd.Function):
+    """Minus the mean of min(w A, clip(w) A), w the ratio of a Gaussian policy to the old one."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the objective, log w, and log w clipped; only the first has a gradient."""
+        loc, scale, action, old_log_prob, advantage, low, high = args
+        z = (action - loc) / scale
+        square = z * z
+        log_prob = -(0.5 * square + scale.log()).sum(-1) - 0.5 * _LOG_2PI * loc.shape[-1]
+        log_ratio = log_prob - old_log_prob
+        clipped = log_ratio.clamp(low, high)
+        gain, clipped_gain = log_ratio.exp() * advantage, clipped.exp() * advantage
+        # d(w A) / d log w = w A; the clipped gain is the smaller one where its own gradient is 0.
+        by = torch.where(gain <= clipped_gain, gain, 0.0).unsqueeze(-1) * (-1.0 / gain.numel())
+        by = by / scale
+        ctx.save_for_backward(by * z, by * (square - 1.0))
+        ctx.mark_non_differentiable(log_ratio, clipped)
+        ctx.set_materialize_grads(False)
+        return -torch.minimum(gain, clipped_gain).mean(), log_ratio, clipped
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
+        """Return the gradients by location and scale."""
+        by_loc, by_scale = ctx.saved_tensors
+        return grad * by_loc, grad * by_scale, None, None, None, None, None
+
+
+def plain_terms(ppo: ClipPPOLoss, data: TensorDictBase) -> dict[str, Tensor] | None:
+    """Compute what ``ppo`` returns without a TensorDict or a distribution in between.
+
+    A quarter of the time of ClipPPOLoss, whose own operations on a minibatch of some hundred frames
+    are few. Held to it by test, in values and gradients.
+
+    Args:
+        ppo: the loss; nothing of it is changed.
+        data: what it would be called with.
+
+    Returns:
+        Its outputs by name, or None where it is configured for more than this function does: then
+        call the loss itself.
+    """
+    heads = _plain_heads(ppo, data)
+    if heads is None:
+        return None
+    actor, critic = heads
+    keys = ppo.tensor_keys
+    advantage = ppo._maybe_normalize_advantage(
+        data.get(keys.advantage), data, update_norm=False
+    ).squeeze(-1)
+    loc, scale = actor.module(*(data.get(key) for key in actor.in_keys))
+    objective, log_ratio, clipped = _ClippedGain.apply(  # type: ignore[no-untyped-call]
+        loc, scale, data.get(keys.action), data.get(keys.sample_log_prob), advantage,
+        *ppo._clip_bounds,
+    )  # fmt: skip
+    value = critic.module(*(data.get(key) for key in critic.in_keys))
+    error = distance_loss(data.get(keys.value_target), value, loss_function=ppo.loss_critic_type)
+    with torch.no_grad():
+        ratio = log_ratio.exp()
+        largest = ratio.max()
+        weight = ratio / largest
+        metrics = {
+            "clip_fraction": (clipped != log_ratio).to(ratio.dtype).mean(),
+            "kl_approx": -log_ratio.mean(),
+            "ESS": weight.sum(0).square() / (weight * weight).sum(0) / len(weight),
+            "max_ratio": largest,
+            "mean_ratio": ratio.mean(),
+        }
+    return {"loss_objective": objective, "loss_critic": ppo.critic_coeff * error.mean(), **metrics}
+
+
+def _plain_heads(
+    ppo: ClipPPOLoss, data: TensorDictBase
+) -> tuple[TensorDictModule, TensorDictModule] | None:
+    """Return the heads of a loss that has nothing beyond the clipped gain and the value error."""
+    actor, critic, keys = ppo.actor_network, ppo.critic_network, ppo.tensor_keys
+    if (
+        type(ppo) is not ClipPPOLoss
+        or ppo.functional
+        or ppo.entropy_bonus
+        or ppo.clip_value
+        or ppo.separate_losses
+        or ppo.delay_actor
+        or ppo.max_importance_ratio is not None
+        or ppo.advantage_norm is not None
+        or ppo.log_explained_variance
+        or ppo.reduction != "mean"
+        or not isinstance(critic, TensorDictModule)
+        or critic.out_keys != [keys.value]
+        or len(getattr(actor, "module", ())) != 2
+    ):
+        return None
+    head, last = actor.module
+    if (
+        not isinstance(head, TensorDictModule)
+        or last.distribution_class is not IndependentNormal
+        or last.distribution_kwargs
+        or list(last.in_keys) != ["loc", "scale"]
+        or head.out_keys != ["loc", "scale"]
+        or data.get(keys.action).requires_grad
+        or data.get(keys.sample_log_prob).requires_grad
+        or data.get(keys.advantage).shape != (*data.shape, 1)
+        or any(data.get(key, None) is not None for key in ppo._loss_mask_keys())
+    ):
+        return None
+    return head, critic
