@@ -103,6 +103,14 @@ def test_the_noise_that_was_added_is_the_noise_that_was_learned(
         torch.testing.assert_close(learned[loud], model.added_std[loud], rtol=0.1, atol=0)
 
 
+def test_spikes_count_as_noise_that_was_added(agents: list[TrainedAgent]) -> None:
+    """A spike of deviation tau that hits with probability p adds p tau^2 to the variance."""
+    quiet, settings = learned_sensors(agents[0]).added_std, agents[0].settings
+    noise = replace(settings.noise, spike_probability=0.25, spike_std=0.02 * 3**0.5)
+    spiky = learned_sensors(replace(agents[0], settings=replace(settings, noise=noise))).added_std
+    torch.testing.assert_close(spiky, 2 * quiet)
+
+
 # The choice -------------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ observation, one running standard deviation of each sensor in training.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,8 +32,9 @@ class SensorModel:
         emission_matrix: H, shape ``(obs, state)``.
         predicted_cov: P = Q, shape ``(state, state)``.
         emission_cov: R, shape ``(obs, obs)``.
-        added_std: standard deviation of the noise that the sensors did have in training, in the
-            same units as R's, shape ``(obs,)``; R should hold it, and what the model can't explain.
+        added_std: standard deviation of the noise that the sensors did have in training, spikes
+            included, in the units of R's, shape ``(obs,)``; R should hold it, and what the model
+            can't explain.
     """
 
     names: list[str]
@@ -119,13 +121,14 @@ def learned_sensors(trained: TrainedAgent) -> SensorModel:
     env, noise = trained.settings.env, trained.settings.noise
     norm = next(t for t in trained.statistics.transform if isinstance(t, MaskedObservationNorm))
     wide = model.double()
+    variance = (noise.sigma * noise.scale) ** 2 + noise.spike_probability * noise.spike_std**2
     return SensorModel(
         sensor_names(env.id, env.version, wide.emission_matrix.shape[0]),
         trained.settings.seed,
         wide.emission_matrix.detach(),
         model.transition_cov.double().detach(),
         wide.full_emission_cov().detach(),
-        noise.sigma * noise.scale / norm.scale.double(),
+        math.sqrt(variance) / norm.scale.double(),
     )
 
 
