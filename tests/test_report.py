@@ -1,7 +1,8 @@
 """The report of finished runs.
 
 Every seed stands beside every mean and none is left out: a mean over fewer seeds than were run is
-not given. The tables are those of the run folders, the same folders give the same bytes, and the
+not given. Interquartile means, intervals, margins and sample efficiency are what a few numbers give
+by hand. The same folders give the same bytes, also from a copy of what is committed, and the
 commands give back the configurations. A folder that can't be used, or runs that make no mean
 together, are answered with one line, and an earlier report is left as it was.
 """
@@ -9,26 +10,40 @@ together, are answered with one line, and an earlier report is left as it was.
 from __future__ import annotations
 
 import csv
+import dataclasses
+import itertools
 import json
 import shlex
 import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from recipe_tools import make_config  # isort: skip
+from recipe_tools import ROOT, make_config  # isort: skip
 
 from assembly.errors import UserError
 from assembly.report_commands import training_command
-from assembly.report_runs import find_folders, flat, read_study
+from assembly.report_paper import steps_to_threshold, top_return
+from assembly.report_runs import (
+    StudyRun,
+    find_folders,
+    flat,
+    point_kind,
+    point_order,
+    read_study,
+)
+from assembly.report_statistics import interquartile_mean, interval
 from assembly.report_tables import format_number
 from assembly.run import EVALUATION_COLUMNS
-from assembly.run_folder import Table, write_config
+from assembly.run_folder import Table, write_config, write_table
 from report import run
 
+ASKED = dict.fromkeys(("run", "out", "index", "title", "rows", "unfinished"))
+COMMITTED = sorted(path.parent for path in (ROOT / "results").glob("*/runs"))
 FRAMES = [100, 200, 300, 400]
 VERSIONS = {"python": "3.11.7", "torch": "2.13.0", "platform": "here", "git_commit": "abc"}
 
@@ -41,6 +56,7 @@ def make_run(
     frames: list[int] = FRAMES,
     points: bool = True,
     versions: dict[str, str] = VERSIONS,
+    method: str | None = None,
 ) -> Path:
     """Write what a run leaves behind, with numbers that are easy to sum up."""
     folder.mkdir(parents=True)
@@ -48,6 +64,9 @@ def make_run(
     config = make_config(*choices, *overrides)
     write_config(folder, config)
     (folder / "versions.json").write_text(json.dumps(versions))
+    if method is not None:
+        cell = {"study": "grid", "choices": {"method": method, "seed": f"s{seed}"}, "overrides": []}
+        (folder / "cell.json").write_text(json.dumps(cell))
     columns = ("frames", "return", "missing_ratio", "log_likelihood", "steps_per_second")
     last = {"return": final, "missing_ratio": 0.3, "log_likelihood": 1.5, "steps_per_second": 200.0}
     first = last | {"return": None, "missing_ratio": 0.1, "steps_per_second": 100.0}
@@ -76,8 +95,7 @@ def make_run(
 
 def report(folders: list[Path] | str, out: Path, **options: Any) -> None:
     wanted = folders if isinstance(folders, str) else [str(folder) for folder in folders]
-    base = {"run": wanted, "out": str(out), "title": None, "rows": 100, "unfinished": False}
-    assert run(base | options) == 0
+    assert run(ASKED | {"run": wanted, "out": str(out)} | options) == 0
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -110,7 +128,10 @@ def test_the_mean_over_seeds_stands_beside_every_seeds_own_number(
     row = quantity(tmp_path / "out", "training return")
     assert (row["mean"], row["std"], row["seeds"]) == ("51", "1", "3")
     assert row["per_seed"] == "0=50 1=51 2=52"
-    assert "**51.00** (50.00, 51.00, 52.00)" in (tmp_path / "out" / "README.md").read_text()
+    assert (
+        "**51.00** [50.22, 51.78] (50.00, 51.00, 52.00)"
+        in (tmp_path / "out" / "README.md").read_text()
+    )
 
 
 def test_means_over_a_run_weigh_every_rollout_the_same(seeds: list[Path], tmp_path: Path) -> None:
@@ -139,7 +160,7 @@ def test_a_mean_that_lacks_a_seed_is_not_given(tmp_path: Path) -> None:
     report(folders, tmp_path / "out")
     row = quantity(tmp_path / "out", "evaluation return", point="mcar:0.5")
     assert (row["mean"], row["per_seed"]) == ("", "0=85 1=")
-    assert "**none** (85.00, none)" in (tmp_path / "out" / "README.md").read_text()
+    assert "| mcar:0.5 |  | **none** |" in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_learning_curves_are_thinned_over_the_whole_run(seeds: list[Path], tmp_path: Path) -> None:
@@ -193,6 +214,172 @@ def test_versions_that_differ_are_told_run_by_run(tmp_path: Path) -> None:
     assert str(tmp_path) not in page
 
 
+# Means and intervals --------------------------------------------------------------------------
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side() -> None:
+    values = np.array([[100.0, 1.0, 2.0, 3.0], [-7.0, 5.0, 5.0, 90.0]])
+    assert interquartile_mean(values).tolist() == [2.5, 5.0]
+    assert interquartile_mean(np.array([1.0, 2.0, 6.0])) == 3.0  # of three none is left out
+    eight = np.arange(8.0) ** 2
+    assert interquartile_mean(eight) == eight[2:6].mean()
+
+
+def test_the_interval_of_few_runs_is_that_of_every_resample() -> None:
+    means = sorted(np.mean(runs) for runs in itertools.product([1.0, 2.0, 6.0], repeat=3))
+    ends = interval([[6.0, 1.0, 2.0]])
+    assert ends is not None
+    np.testing.assert_allclose(ends, np.percentile(means, [2.5, 97.5]), rtol=1e-12)
+    assert interval([[1.0]]) is None
+    assert interval([[1.0, 2.0], [1.0]]) is None  # of one run nothing can be told
+
+
+def test_runs_are_resampled_within_their_stratum() -> None:
+    """Pooled, two tasks on other scales would make an interval as wide as their distance."""
+    ends = interval([[0.0, 0.1, 0.2], [10.0, 10.1, 10.2]])
+    assert ends is not None
+    low, high = (float(end) for end in ends)
+    assert 4.95 < low < 5.1 < high < 5.25
+
+
+def test_drawn_resamples_agree_with_the_normal_approximation_and_do_not_vary() -> None:
+    values = np.random.default_rng(3).normal(size=40)
+    state = np.random.get_state()[1].copy()
+    ends = interval([values], lambda resampled: resampled[0].mean(-1))
+    again = interval([values], lambda resampled: resampled[0].mean(-1))
+    assert ends is not None
+    assert again is not None
+    half = 1.96 * values.std() / np.sqrt(40)
+    np.testing.assert_allclose(ends, [values.mean() - half, values.mean() + half], atol=0.03)
+    assert (ends[0], ends[1]) == (again[0], again[1])
+    assert (np.random.get_state()[1] == state).all()
+
+
+def test_a_curve_has_the_interval_of_its_points() -> None:
+    curves = np.array([[1.0, 5.0, 0.0], [2.0, 6.0, 0.0], [4.0, 4.0, 3.0]])
+    ends = interval([curves])
+    assert ends is not None
+    for i in range(3):
+        point = interval([curves[:, i]])
+        assert point is not None
+        np.testing.assert_array_equal(np.array(ends)[:, i], np.array(point))
+
+
+# Beside the paper -----------------------------------------------------------------------------
+
+
+def test_margins_over_other_methods_stand_beside_those_of_the_paper(tmp_path: Path) -> None:
+    finals = {"drbpn": (240.0, 260.0), "dvrl": (90.0, 110.0), "fill": (400.0, 600.0)}
+    folders = [
+        make_run(tmp_path / f"{m}{s}", method=m, seed=s, final=returns[s], points=False)
+        for m, returns in finals.items()
+        for s in (0, 1)
+    ]
+    report(folders, tmp_path / "out")
+    rows = [row for row in table(tmp_path / "out" / "margins.csv") if row["mode"] == "sampled"]
+    assert [(row["over"], row["margin"], row["paper"]) for row in rows] == [
+        ("dvrl", "1.5", "0.2"),  # Hopper
+        ("fill", "-0.5", ""),
+    ]
+    # 240 / 110 and 260 / 90 are the extremes of 16 resamples.
+    assert 240 / 110 - 1 <= float(rows[0]["low"]) < 1.5 < float(rows[0]["high"]) <= 260 / 90 - 1
+    page = (tmp_path / "out" / "README.md").read_text()
+    assert "| mar:0.5 | sampled actions | `dvrl` | +150 % [+" in page
+    assert "python recipes/study.py study=grid\n" in page
+    assert "python recipes/report.py 'run=runs/grid/*' out=results/out rows=100\n" in page
+
+
+def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Path) -> None:
+    finals = {"hopper": (1000.0, 3000.0), "walker2d": (3000.0, 6000.0)}  # thresholds 2000, 3000
+    folders = [
+        make_run(tmp_path / f"{t}{s}", f"env={t}", "env.version=v4", seed=s, final=f, points=False)
+        for t, returns in finals.items()
+        for s, f in enumerate(returns)
+    ]
+    # A method with one task only is not compared with one that has both.
+    folders.append(make_run(tmp_path / "gru", "belief=gru", points=False))
+    report(folders, tmp_path / "out")
+    rows = [r for r in table(tmp_path / "out" / "aggregate.csv") if r["mode"] == "sampled"]
+    assert [(r["method"], r["iqm"], r["runs"]) for r in rows] == [("drbpn", "1.25", "4")]
+
+
+@pytest.fixture
+def clean_run(tmp_path: Path) -> StudyRun:
+    folder = make_run(tmp_path / "clean", "experiment=clean", "env.version=v4", points=False)
+    episodes = [{"frames": 10 * i, "return": float(i), "length": 10} for i in range(1, 31)]
+    episodes.append({"frames": 2_000_001, "return": 1e9, "length": 10})  # too late
+    Table(folder / "episodes.csv", ("frames", "return", "length")).append(episodes)
+    (run_read,) = read_study([folder])
+    return run_read
+
+
+def test_the_top_ten_are_the_best_episodes_within_two_million_steps(clean_run: StudyRun) -> None:
+    assert top_return(clean_run) == np.mean(range(21, 31))
+    assert top_return(dataclasses.replace(clean_run, episodes=clean_run.episodes[:9])) is None
+
+
+def test_a_threshold_is_reached_by_a_mean_of_a_hundred_episodes(clean_run: StudyRun) -> None:
+    def steps(*rows: tuple[int, int, float | None]) -> int | None:
+        keys = ("frames", "episodes", "return")
+        training = [dict(zip(keys, row, strict=True)) for row in rows]
+        return steps_to_threshold(dataclasses.replace(clean_run, training=training), 2000.0)
+
+    lucky, good, bad = (2048, 7, 2500.0), (8192, 130, 2001.0), (6144, 120, 1999.0)
+    assert steps((1024, 0, None), lucky, (4096, 100, None), bad, good) == 8192
+    assert steps(lucky, bad) is None
+    assert steps((2_000_001, 900, 2500.0)) is None
+
+
+def test_sample_efficiency_is_told_of_clean_runs_and_says_what_was_not_reached(
+    clean_run: StudyRun, tmp_path: Path
+) -> None:
+    del clean_run  # written
+    make_run(tmp_path / "noisy", points=False)
+    report([tmp_path / "clean", tmp_path / "noisy"], tmp_path / "out")
+    rows = table(tmp_path / "out" / "efficiency.csv")
+    assert [(r["task"], r["threshold"], r["steps_to_threshold"]) for r in rows] == [
+        ("Hopper-v4", "2000", "")
+    ]
+    page = (tmp_path / "out" / "README.md").read_text()
+    assert "| `drbpn` | 0 | **25.50** (25.50) | 2000 | not reached in 400 |" in page
+
+
+# Points ---------------------------------------------------------------------------------------
+
+
+def test_points_of_one_kind_differ_in_one_number() -> None:
+    names = ["none:0", "mcar:0.5", "reduction:0.4:model", "outages:0.5:20:sensor", "spikes:0.1:10"]
+    assert [point_kind(name) for name in names] == [
+        "none",
+        "mcar",
+        "reduction model",
+        "outages 0.5 sensor",
+        "spikes 10",
+    ]
+    assert [point_order(name)[1] for name in names] == [0.0, 0.5, 0.4, 20.0, 0.1]
+    assert point_order("outages:0.5")[1] == 0.5
+    assert sorted(["mcar:0.2", "none:0", "mar:0.5"], key=point_order)[0] == "none:0"
+
+
+def test_points_go_by_the_name_that_the_evaluation_gave_them(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run")
+    rows = table(folder / "points.csv")
+    for row in rows:  # two ways of taking sensors away, which mechanism and eta do not tell apart
+        if row["mechanism"] == "mcar":
+            row["mechanism"], row["eta"] = "none", "0"
+            row["point"] = f"reduction:0.5:{'model' if row['episode'] == '0' else 'random'}"
+    for row in rows:
+        row.setdefault("point", "none:0")
+    write_table(folder / "points.csv", rows)
+    report([folder], tmp_path / "out")
+    means = {
+        row["point"]: row["return_mean"]
+        for row in table(tmp_path / "out" / "evaluation.csv")
+        if row["source"] == "points"
+    }
+    assert means == {"none:0": "100", "reduction:0.5:model": "80", "reduction:0.5:random": "90"}
+
+
 # Rebuilding -----------------------------------------------------------------------------------
 
 
@@ -202,9 +389,44 @@ def test_the_same_run_folders_give_the_same_bytes(seeds: list[Path], tmp_path: P
     report(str(moved / "*"), tmp_path / "second" / "study")
     first, second = (sorted((tmp_path / n / "study").iterdir()) for n in ("first", "second"))
     assert [p.name for p in first] == [p.name for p in second]
-    assert len(first) == 6
+    assert len(first) == 7
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes(), one.name
+
+
+def test_a_report_is_made_again_from_a_copy_of_what_is_committed(
+    seeds: list[Path], tmp_path: Path
+) -> None:
+    study = tmp_path / "results" / "study"
+    study.mkdir(parents=True)
+    (study / "notes.md").write_text("What we saw.\n\nMore of it.\n")
+    report(seeds, study, title='Three "seeds"', rows=3)
+    shutil.copytree(tmp_path / "runs", study / "runs")
+    clone = shutil.copytree(tmp_path / "results", tmp_path / "clone")
+    for path in (clone / "study").glob("*.*"):  # of what is committed, the made files
+        if path.name not in ("notes.md", "report.yaml"):
+            path.unlink()
+    run(ASKED | {"index": str(clone)})
+    for path in (p for p in study.iterdir() if p.is_file()):
+        assert (clone / "study" / path.name).read_bytes() == path.read_bytes(), path.name
+    index = (clone / "README.md").read_text()
+    assert '## [Three "seeds"](study/README.md)\n\nWhat we saw.\n' in index
+    assert "More of it" not in index
+    report([], study, run=None)  # once more, in its own place
+    run(ASKED | {"index": str(tmp_path / "results")})
+    assert (tmp_path / "results" / "README.md").read_text() == index
+    assert "# Three" in (study / "README.md").read_text()
+
+
+@pytest.mark.parametrize("study", COMMITTED, ids=lambda path: path.name)
+def test_committed_tables_are_what_their_runs_give(study: Path, tmp_path: Path) -> None:
+    copy = tmp_path / study.name
+    copy.mkdir()
+    for name in ("notes.md", "report.yaml"):
+        shutil.copy(study / name, copy / name)
+    report(str(study / "runs" / "*"), copy)
+    for path in (*study.glob("*.csv"), study / "README.md"):
+        assert (copy / path.name).read_bytes() == path.read_bytes(), path.name
 
 
 def test_the_command_of_a_run_gives_its_configuration_back(tmp_path: Path) -> None:
@@ -283,8 +505,14 @@ def test_a_bad_folder_is_answered_with_one_line_and_the_old_report_stays(
 def test_no_folder_at_all_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="matches none"):
         find_folders(str(tmp_path / "*"))
-    with pytest.raises(UserError, match="`run` and `out` must be given"):
+    with pytest.raises(UserError, match="`out` must be given"):
+        run(ASKED | {"run": str(tmp_path)})
+    with pytest.raises(UserError, match=r"out/runs/\* matches none"):
         report([], tmp_path / "out", run=None)
+    with pytest.raises(UserError, match=r"`index` .* leave out `run` and `out`"):
+        run(ASKED | {"index": str(tmp_path), "out": "x"})
+    with pytest.raises(UserError, match=r"`index` must be a folder of studies .* holds none"):
+        run(ASKED | {"index": str(tmp_path)})
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="`out` must be a folder"):
         report([], tmp_path / "file")

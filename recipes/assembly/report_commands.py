@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 from collections.abc import Sequence
 from typing import Any
@@ -41,7 +42,7 @@ def training_command(run: StudyRun) -> str:
         "noise": "gaussian" if s.noise.sigma > 0 else "none",
     }
     try:
-        defaults = composed_config([])
+        defaults = _composed()
         chosen = {
             "belief": defaults["belief"].get("name"),
             "algo": defaults["algo"].get("name"),
@@ -49,7 +50,7 @@ def training_command(run: StudyRun) -> str:
             "noise": "gaussian" if defaults["noise"]["sigma"] > 0 else "none",
         }
         groups += [f"{group}={name}" for group, name in choices.items() if name != chosen[group]]
-        base = flat(composed_config(groups))
+        base = flat(_composed(*groups))
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(
             f"`{run.name}` can't be put into a command, conf/ lacks a group of "
@@ -127,6 +128,12 @@ def rebuild_command(name: str) -> str:
         The command.
     """
     return f"python recipes/report.py out=results/{name}"
+
+
+@functools.cache
+def _composed(*groups: str) -> dict[str, Any]:
+    """Compose once what all seeds of a task and method share; to be read only."""
+    return composed_config(groups)
 
 
 def _value(value: Any) -> str:

@@ -19,6 +19,13 @@ _PANEL = (4.3, 3.1)  # inches
 _COLUMNS = 3
 _GRID = 200  # points of a curve
 _NOTHING = "none"
+_RATIO = "realised missing ratio"
+# What else than the missing ratio the points of a family differ in.
+_AXES = {
+    "outages": "mean length of an outage, steps",
+    "noise": "sigma of the noise",
+    "spikes": "probability of a spike",
+}
 _NAMES = {"mcar": "MCAR", "mar": "MAR", "nmar": "NMAR"}
 
 _Group = Sequence[StudyRun]
@@ -92,7 +99,7 @@ def robustness(runs: Sequence[StudyRun], mode: str = "sampled") -> Figure | None
                     nominal = False  # once a panel is enough
                 axis.set_title(f"{task}, {_NAMES.get(kind, kind)}")
                 axis.set_xlim(left=-0.02)
-                axis.set_xlabel("realised missing ratio")
+                axis.set_xlabel(_AXES.get(kind.split(" ")[0], _RATIO))
                 low, high = min(0.0, axis.dataLim.ymin), max(0.0, axis.dataLim.ymax)
                 room = 0.12 * (high - low or 1.0)
                 axis.set_ylim(low - (room if low < 0 else 0), high + room)
@@ -207,7 +214,7 @@ def _series(members: _Group, mode: str) -> list[tuple[str, list[str]]]:
     out = []
     for kind in sorted({point_kind(p) for p in whole} - {_NOTHING}):
         own = [p for p in whole if point_kind(p) == kind]
-        ordered = sorted([*clean, *own], key=point_order)
+        ordered = sorted(own if kind.split(" ")[0] in _AXES else [*clean, *own], key=point_order)
         if len(ordered) > 1:
             out.append((kind, ordered))
     return out
@@ -226,9 +233,10 @@ def _draw_points(
     # shape: (seeds, points)
     ratios = np.array([[row["missing_ratio"] for row in line if row] for line in found])
     returns = [np.array([row["return_mean"] for row in line if row]) for line in found]
-    x = ratios.mean(0)
+    other = point_kind(points[-1]).split(" ")[0] in _AXES
+    x = np.array([point_order(point)[1] for point in points]) if other else ratios.mean(0)
     mean = _draw_band(axis, x, returns, colour, label, style="o-")
-    if not nominal:
+    if other or not nominal:
         return
     for point, at, height in zip(points, x, mean, strict=True):
         if not point.startswith(_NOTHING):

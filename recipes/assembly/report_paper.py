@@ -120,7 +120,7 @@ def margin_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row]:
     returns = {
         (*_place(row), row["method"]): row["values"]
         for row in summary
-        if row["quantity"] == "evaluation return" and row["point"].endswith(":0.5")
+        if row["quantity"] == "evaluation return" and _half_missing(row["point"])
     }
     order = list(dict.fromkeys(members[0].group["method"] for members in grouped(runs)))
     rows = []
@@ -178,6 +178,11 @@ def aggregate_rows(summary: Sequence[Row]) -> list[Row]:
                 }
             )
     return rows
+
+
+def _half_missing(point: str) -> bool:
+    family, ratio, *_ = point.split(":")
+    return family in ("mcar", "mar", "nmar", "reduction") and float(ratio) == 0.5
 
 
 def _place(row: Row) -> tuple[str, str, str, str]:

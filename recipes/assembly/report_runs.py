@@ -81,13 +81,15 @@ def point_name(missingness: MissingnessSettings) -> str:
     """Return missingness as ``recipes/evaluate.py`` takes it, such as ``mcar:0.5``.
 
     Args:
-        missingness: mechanism and eta.
+        missingness: mechanism, eta and, of outages, their length and groups.
 
     Returns:
-        ``mechanism:eta``.
+        ``mechanism:eta``, or ``outages:eta:mean_length:group_by``.
     """
-    eta = 0.0 if missingness.mechanism == "none" else missingness.eta
-    return f"{missingness.mechanism}:{eta:g}"
+    m = missingness
+    if m.mechanism == "outages":
+        return f"outages:{m.eta:g}:{m.mean_length:g}:{m.group_by}"
+    return f"{m.mechanism}:{0.0 if m.mechanism == 'none' else m.eta:g}"
 
 
 # Reading --------------------------------------------------------------------------------------
@@ -316,8 +318,10 @@ def _points(episodes: Sequence[Row]) -> list[Row]:
     """Sum up the episodes of recipes/evaluate.py, one row a point and kind of action."""
     together: dict[tuple[Any, ...], dict[Any, Row]] = {}
     for index, row in enumerate(episodes):
+        # Older tables have no name of the point.
         eta = 0.0 if row["mechanism"] == "none" else row["eta"]
-        key = (row["frames"], f"{row['mechanism']}:{eta:g}", row["mode"])
+        point = row.get("point") or f"{row['mechanism']}:{eta:g}"
+        key = (row["frames"], point, row["mode"])
         # A point that was asked for under two names has the same episodes twice.
         together.setdefault(key, {})[row.get("episode", index)] = row
     rows = []
@@ -364,26 +368,29 @@ def mean_of_known(values: Iterable[Any]) -> Any:
 
 
 def point_order(point: str) -> tuple[str, float]:
-    """Return what points are sorted by: none first, then by kind and ratio.
+    """Return what points are sorted by: nothing missing first, then by kind and number.
 
     Args:
-        point: ``mechanism:eta``, and what else tells it from others after a blank.
+        point: as ``recipes/evaluate.py`` names it.
 
     Returns:
-        A key for ``sorted``.
+        A key for ``sorted``: the kind, and the number in which points of it differ: the nominal
+        ratio, the mean length of outages, the size of noise, the probability of spikes.
     """
-    kind = point_kind(point)
-    return "" if kind == "none" else kind, float(point.partition(":")[2].split(" ")[0])
+    kind, parts = point_kind(point), point.split(":")
+    number = parts[2] if parts[0] == "outages" and len(parts) > 2 else parts[1]
+    return "" if kind == "none" else kind, float(number)
 
 
 def point_kind(point: str) -> str:
-    """Return what points have in common that differ in their nominal ratio alone.
+    """Return what points have in common that differ in one number.
 
     Args:
-        point: such as ``mcar:0.5`` or ``reduction:0.5 random``.
+        point: such as ``mcar:0.5``, ``reduction:0.5:random`` or ``outages:0.5:20:sensor``.
 
     Returns:
-        Such as ``mcar`` or ``reduction random``.
+        Such as ``mcar``, ``reduction random`` or ``outages 0.5 sensor``.
     """
-    mechanism, _, rest = point.partition(":")
-    return " ".join([mechanism, *rest.split(" ")[1:]])
+    family, *rest = point.split(":")
+    varied = 1 if family == "outages" and len(rest) > 1 else 0
+    return " ".join([family, *(part for i, part in enumerate(rest) if i != varied)])
