@@ -3,7 +3,8 @@
 theory.md maps every equation of the paper to functions and tests: each function resolves by
 import, each test exists, and every equation that a docstring cites has a row that names the owner
 of that docstring. api.md lists the public names. Relative links lead somewhere. The guide's code is
-the script beside it, block for block, and the script runs by itself in another folder.
+the script beside it, block for block, and the script runs by itself in another folder; so are the
+files of new_belief.md, which test_new_belief.py runs.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ PACKAGE = ROOT / "torchrl_drbpn"
 PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 SCRIPT = DOCS / "guide" / "library_example.py"
 GUIDE = DOCS / "guide" / "belief_in_your_ppo.md"
+NEW_BELIEF = DOCS / "new_belief.md"
+EXAMPLE = DOCS / "new_belief"
 EQUATIONS = {2, 3, 8, 10, 11, 12, 13}
 
 # "Eq. (8), (10), (12) [DRBPN]", "eq. 2, 3, 8 [DRBPN]", "(eq. 10 and 12 [DRBPN])"
@@ -223,9 +226,21 @@ def test_every_relative_link_leads_somewhere(page):
 
 
 # -------------------------------------------------------------------------------------------- guide
-def test_the_blocks_of_the_guide_are_the_script_and_all_of_it():
-    blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
-    rest = SCRIPT.read_text(encoding="utf-8")
+def blocks_of(page: Path, language: str = "python") -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "script"),
+    [
+        (blocks_of(GUIDE), SCRIPT),
+        (blocks_of(NEW_BELIEF)[:-1], EXAMPLE / "moving_average.py"),
+        (blocks_of(NEW_BELIEF)[-1:], EXAMPLE / "test_moving_average.py"),
+    ],
+    ids=["guide", "new belief", "its test"],
+)
+def test_the_blocks_of_a_page_are_the_script_and_all_of_it(blocks, script):
+    rest = script.read_text(encoding="utf-8")
     left = []
     for block in blocks:
         before, found, rest = rest.partition(block)
@@ -235,6 +250,11 @@ def test_the_blocks_of_the_guide_are_the_script_and_all_of_it():
     assert isinstance(ast.parse(module_docstring).body[0], ast.Expr)
     assert len(ast.parse(module_docstring).body) == 1
     assert not "".join([*between, rest]).strip(), "the page leaves out a part of the script"
+
+
+def test_the_entry_that_the_page_shows_is_the_file():
+    (block,) = blocks_of(NEW_BELIEF, "yaml")
+    assert block == (EXAMPLE / "conf/belief/moving_average.yaml").read_text(encoding="utf-8")
 
 
 def test_the_script_of_the_guide_imports_core_dependencies_alone():

@@ -1,7 +1,8 @@
 """Belief modules: each file builds one, each conf/belief entry names one of these builders.
 
 A builder takes the sizes of the task and its own settings, and returns a :class:`Belief`. A new
-belief module is a new file here and a new entry in conf/belief; nothing else changes.
+belief module is a new file here and a new entry in conf/belief; nothing else changes. Both may lie
+elsewhere too: docs/new_belief.md.
 
 A belief that has something to say about the sensors offers it by `Belief.observing`: a module with
 the same weights that writes, beside everything else, whichever of these it has. All of it is in
