@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +14,7 @@ from assembly.agent import Agent, add_primers
 from assembly.beliefs import Belief
 from assembly.environment import copy_statistics, make_environment
 from assembly.settings import MissingnessSettings, NoiseSettings, Settings
-from torchrl_drbpn import seed_env
+from torchrl_drbpn import SensorReduction, seed_env
 
 _KINDS = {"sampled": ExplorationType.RANDOM, "mean": ExplorationType.DETERMINISTIC}
 
@@ -73,6 +73,7 @@ def make_evaluation_environment(
     missingness: MissingnessSettings | None = None,
     noise: NoiseSettings | None = None,
     complete: bool = False,
+    removed: Sequence[int] = (),
 ) -> TransformedEnv:
     """Build an environment like the training one, one simulator an episode.
 
@@ -84,11 +85,13 @@ def make_evaluation_environment(
         missingness: what does not arrive; None: as in training.
         noise: what is added; None: as in training.
         complete: whether to write ``complete_observation`` too, for measurements alone.
+        removed: components that never arrive, on top of ``missingness``.
 
     Returns:
         The environment. Its statistics are empty: see
         :func:`assembly.environment.copy_statistics`.
     """
+    reduction = [SensorReduction(list(removed))] if removed else []
     env = make_environment(
         settings.env,
         missingness or settings.missingness,
@@ -98,8 +101,8 @@ def make_evaluation_environment(
         num_threads=settings.collector.num_threads,
         gamma=settings.loss.gamma,
         seed=settings.evaluation.seed,
-        before_normalisation=belief.transforms(),
         complete=complete,
+        before_normalisation=[*reduction, *belief.transforms()],
     )
     add_primers(env, agent)
     return env
@@ -141,7 +144,7 @@ def evaluate(
 def _first_episodes(
     policy: TensorDictModuleBase, env: TransformedEnv, stop: Callable[[], bool]
 ) -> Episodes | None:
-    """Step all environments until each has finished once."""
+    """Step each environment until it has finished once; those that have are left standing."""
     count = env.batch_size[0]
     running = torch.ones(count, 1, dtype=torch.bool)
     returns = torch.zeros(count, 1, dtype=torch.float64)
@@ -153,7 +156,8 @@ def _first_episodes(
     while running.any():
         if stop():
             return None
-        stepped, following = env.step_and_maybe_reset(policy(root))
+        # An episode that is over costs no simulation; its row of the batch changes no other row.
+        stepped = env.step(policy(root).set("_step", running))
         mask = stepped.get("observed")
         components = mask.shape[-1]
         observed += mask.sum(-1, keepdim=True) * running
@@ -164,7 +168,7 @@ def _first_episodes(
         returns += stepped.get(("next", "reward")) * running
         lengths += running
         running = running & ~stepped.get(("next", "done"))
-        root = following
+        root = env.step_mdp(stepped)
     missing = 1 - observed / (lengths * components).double()
     per_entry = log_likelihood / observed.clamp_min(1)
     return Episodes(

@@ -1,25 +1,68 @@
-"""Evaluate a trained agent under several kinds of missingness."""
+"""Points of an evaluation: what is taken away or falsified there, and how an agent fares."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
+
+import torch
 
 from assembly.errors import UserError
 from assembly.evaluation import Episodes, evaluate, make_evaluation_environment
-from assembly.settings import MissingnessSettings, check_mode
+from assembly.sensor_choice import kept_sensors
+from assembly.settings import (
+    GROUPINGS,
+    MissingnessSettings,
+    NoiseSettings,
+    Settings,
+    check_mode,
+    check_outages,
+)
 from assembly.trained import TrainedAgent
 
 _MECHANISMS = ("none", "mcar", "mar", "nmar")
+_SELECTIONS = ("model", "random")
 _TRAINED = "trained"
+_READABLE = (
+    "`points` must hold trained or mechanism:eta such as mcar:0.5, with one of none, mcar, mar, "
+    "nmar and eta in [0, 1], outages:eta:mean_length[:sensor, joint or kind], "
+    "reduction:ratio:model or random, noise:sigma or spikes:probability[:std]; got {!r}."
+)
+
+
+@dataclass(frozen=True)
+class Point:
+    """What an agent is evaluated under; what a point does not name stays as in training.
+
+    Attributes:
+        name: in full, such as ``outages:0.5:20:sensor``: it reads back to the same point.
+        family: the part before the first colon.
+        missingness: which entries do not arrive.
+        noise: what is added to those that do.
+        ratio: share of the sensors that is taken away for good.
+        selection: ``model`` or ``random``, which sensors stay; empty: all.
+    """
+
+    name: str
+    family: str
+    missingness: MissingnessSettings
+    noise: NoiseSettings
+    ratio: float = 0.0
+    selection: str = ""
+
+
+# Reading --------------------------------------------------------------------------------------
 
 
 def read_point(text: str, trained: MissingnessSettings) -> MissingnessSettings:
-    """Read a point such as ``mcar:0.5``.
+    """Read a point that says which entries do not arrive, such as ``mcar:0.5``.
 
     Args:
-        text: ``mechanism:eta``, or ``trained`` for what the agent was trained with.
+        text: ``mechanism:eta``, ``outages:eta:mean_length[:group_by]``, or ``trained`` for what the
+            agent was trained with.
         trained: gives what the text leaves open: mechanism seed, always observed share.
 
     Returns:
@@ -30,87 +73,203 @@ def read_point(text: str, trained: MissingnessSettings) -> MissingnessSettings:
     """
     if text == _TRAINED:
         return trained
-    mechanism, _, number = text.partition(":")
+    family, *words = text.split(":")
+    if family == "outages" and len(words) in (2, 3):
+        group_by = words[2] if len(words) == 3 else "sensor"
+        eta, length = _number(words[0], 1.0), _number(words[1])
+        if eta is not None and length is not None and group_by in GROUPINGS:
+            outages = dataclasses.replace(
+                trained, mechanism="outages", eta=eta, mean_length=length, group_by=group_by
+            )
+            check_outages(outages)
+            return outages
+    elif family in _MECHANISMS and len(words) == 1:
+        eta = _number(words[0], 1.0)
+        if eta is not None:
+            return dataclasses.replace(trained, mechanism=family, eta=eta)
+    raise UserError(_READABLE.format(text))
+
+
+def parse_point(text: str, settings: Settings, *, spike_std: float) -> Point:
+    """Read any point.
+
+    Args:
+        text: see conf/evaluate.yaml.
+        settings: of the run: what the point does not name stays.
+        spike_std: deviation of spikes where the text gives none, raw units.
+
+    Returns:
+        The point.
+
+    Raises:
+        UserError: if the text can't be read.
+    """
+    missingness, noise = settings.missingness, settings.noise
+    family, *words = text.split(":")
+    first = _number(words[0]) if words else None
+    if family == "noise" and first is not None and len(words) == 1:
+        changed = dataclasses.replace(noise, sigma=first)
+        return Point(f"noise:{first:g}", family, missingness, changed)
+    if family == "spikes" and first is not None and first <= 1 and len(words) <= 2:
+        std = _number(words[1]) if len(words) == 2 else spike_std
+        if std is not None:
+            changed = dataclasses.replace(noise, spike_probability=first, spike_std=std)
+            return Point(f"spikes:{first:g}:{std:g}", family, missingness, changed)
+    if family == "reduction" and len(words) == 2 and first is not None and first <= 1:
+        if words[1] in _SELECTIONS:
+            nothing = dataclasses.replace(missingness, mechanism="none", eta=0.0)
+            name = f"reduction:{first:g}:{words[1]}"
+            return Point(name, family, nothing, noise, first, words[1])
+        raise UserError(_READABLE.format(text))
     try:
-        eta = float(number)
+        read = read_point(text, missingness)
+    except UserError as error:
+        if family in ("noise", "spikes"):
+            raise UserError(_READABLE.format(text)) from error
+        raise
+    return Point(missingness_name(read), read.mechanism, read, noise)
+
+
+def missingness_name(missingness: MissingnessSettings) -> str:
+    """Return missingness as a point, such as ``mcar:0.5`` or ``outages:0.5:20:sensor``.
+
+    Args:
+        missingness: mechanism, eta and, of outages, their length and groups.
+
+    Returns:
+        Text that :func:`read_point` reads back.
+    """
+    m = missingness
+    if m.mechanism == "outages":
+        return f"outages:{m.eta:g}:{m.mean_length:g}:{m.group_by}"
+    return f"{m.mechanism}:{0.0 if m.mechanism == 'none' else m.eta:g}"
+
+
+def _number(text: str, most: float = math.inf) -> float | None:
+    """Read a number from 0 to ``most``; None where there is none."""
+    try:
+        value = float(text)
     except ValueError:
-        eta = float("nan")
-    if mechanism not in _MECHANISMS or not 0 <= eta <= 1:
-        raise UserError(
-            f"`points` must hold {_TRAINED} or mechanism:eta such as mcar:0.5, with one of "
-            f"{', '.join(_MECHANISMS)} and eta in [0, 1]; got {text!r}."
-        )
-    return dataclasses.replace(trained, mechanism=mechanism, eta=eta)
+        return None
+    return value if 0 <= value <= most and value < math.inf else None
+
+
+# Evaluating -----------------------------------------------------------------------------------
+
+
+def removed_sensors(point: Point, trained: TrainedAgent, reduction_seed: int) -> list[int]:
+    """Return the sensors that a point takes away for good.
+
+    Args:
+        point: the point.
+        trained: the agent, whose model may choose.
+        reduction_seed: of the random choice: the same sensors for every agent of a task, those of a
+            smaller ratio among those of a larger one.
+
+    Returns:
+        Indices of components, in order.
+
+    Raises:
+        UserError: if the model is to choose and there is none.
+    """
+    if not point.selection:
+        return []
+    obs_dim = trained.statistics.observation_spec["observation"].shape[-1]
+    count = round(point.ratio * obs_dim)
+    if point.selection == "model":
+        kept = set(kept_sensors(trained, obs_dim - count))
+        return [index for index in range(obs_dim) if index not in kept]
+    generator = torch.Generator().manual_seed(reduction_seed)
+    return sorted(torch.randperm(obs_dim, generator=generator)[:count].tolist())
 
 
 def evaluate_points(
     trained: TrainedAgent,
-    points: Sequence[str],
+    points: Sequence[Point],
     *,
     episodes: int,
     modes: Sequence[str],
     seed: int,
-) -> Iterator[tuple[MissingnessSettings, str, Episodes]]:
-    """Evaluate an agent at each point with each kind of action, on the noise it was trained with.
+    reduction_seed: int = 0,
+) -> Iterator[tuple[Point, str, Episodes]]:
+    """Evaluate an agent at each point with each kind of action.
 
     Args:
         trained: the agent.
-        points: see :func:`read_point`.
+        points: see :func:`parse_point`.
         episodes: per point and kind of action.
         modes: ``sampled``, ``mean``, or both.
         seed: of episodes, corruption and sampled actions; the same for every point.
+        reduction_seed: see :func:`removed_sensors`.
 
     Yields:
-        Missingness, kind of action, episodes.
+        Point, kind of action, episodes.
 
     Raises:
-        UserError: if a point or a kind of action can't be read, or ``episodes`` is not positive.
+        UserError: if a kind of action can't be read, ``episodes`` is not positive, or a point needs
+            a model that the agent lacks.
     """
     if episodes < 1:
         raise UserError(f"`episodes` must be positive, got {episodes}.")
     for mode in modes:
         check_mode(mode)
-    settings = trained.settings
-    read = [read_point(point, settings.missingness) for point in points]
-    for missingness in read:
+    removed = [removed_sensors(point, trained, reduction_seed) for point in points]
+    for point, sensors in zip(points, removed, strict=True):
         env = make_evaluation_environment(
-            settings, trained.belief, trained.agent, episodes=episodes, missingness=missingness
+            trained.settings,
+            trained.belief,
+            trained.agent,
+            episodes=episodes,
+            missingness=point.missingness,
+            noise=point.noise,
+            removed=sensors,
         )
         for mode in modes:
             result = evaluate(
                 trained.agent.policy, env, mode=mode, seed=seed, statistics=trained.statistics
             )
             assert result is not None  # nothing asks it to stop
-            yield missingness, mode, result
+            yield point, mode, result
         env.close()
 
 
 def episode_rows(
-    trained: TrainedAgent, missingness: MissingnessSettings, mode: str, result: Episodes
+    trained: TrainedAgent, point: Point, mode: str, result: Episodes, *, run: str = ""
 ) -> list[dict[str, Any]]:
     """Return one row an episode.
 
     Args:
         trained: the agent.
-        missingness: what did not arrive.
+        point: what it was evaluated under.
         mode: kind of action.
         result: the episodes.
+        run: name of its folder.
 
     Returns:
-        Columns and values, the same columns for every evaluation.
+        Columns and values, the same columns for every evaluation; None where a column says nothing.
     """
-    settings = trained.settings
+    settings, missing, noise = trained.settings, point.missingness, point.noise
+    outages, spikes = missing.mechanism == "outages", noise.spike_probability > 0
     common = {
+        "run": run,
         "env": settings.env.env_id,
         "belief": settings.belief.get("name", ""),
         "training_seed": settings.seed,
         "frames": trained.frames,
-        "trained_mechanism": settings.missingness.mechanism,
-        "trained_eta": settings.missingness.eta,
-        "noise_sigma": settings.noise.sigma,
-        "mechanism": missingness.mechanism,
-        "eta": missingness.eta,
-        "mechanism_seed": missingness.mechanism_seed,
+        "trained_on": missingness_name(settings.missingness),
+        "trained_noise_sigma": settings.noise.sigma,
+        "point": point.name,
+        "family": point.family,
+        "mechanism": missing.mechanism,
+        "eta": 0.0 if missing.mechanism == "none" else missing.eta,
+        "mechanism_seed": missing.mechanism_seed,
+        "mean_length": missing.mean_length if outages else None,
+        "group_by": missing.group_by if outages else None,
+        "removed_ratio": point.ratio if point.selection else None,
+        "removed_by": point.selection or None,
+        "noise_sigma": noise.sigma,
+        "spike_probability": noise.spike_probability,
+        "spike_std": noise.spike_std if spikes else None,
         "mode": mode,
     }
     likelihoods: Sequence[float | None] = result.log_likelihoods or [None] * len(result.returns)
@@ -121,8 +280,8 @@ def episode_rows(
             "episode": index,
             "return": value,
             "length": length,
-            "missing_ratio": missing,
+            "missing_ratio": ratio,
             "log_likelihood": likelihood,
         }
-        for index, (value, length, missing, likelihood) in enumerate(columns)
+        for index, (value, length, ratio, likelihood) in enumerate(columns)
     ]

@@ -1,0 +1,277 @@
+"""The grid of an evaluation: which points, which of them are done, and doing the rest.
+
+A point of a run is the unit: its episodes are in the table whole or not at all, and the table is
+written anew after each, so that an evaluation killed at any moment goes on where it was.
+"""
+
+from __future__ import annotations
+
+import csv
+import multiprocessing
+import os
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from assembly.errors import UserError
+from assembly.points import Point, episode_rows, evaluate_points, parse_point
+from assembly.run_folder import write_table
+from assembly.settings import Settings
+from assembly.trained import TrainedAgent, load_trained_agent
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Levels of the default grid; see conf/evaluate.yaml."""
+
+    ratios: list[float]
+    outage_ratios: list[float]
+    outage_lengths: list[float]
+    outage_groups: list[str]
+    noise_sigmas: list[float]
+    spike_probabilities: list[float]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How every point is evaluated; see conf/evaluate.yaml."""
+
+    episodes: int
+    modes: list[str]
+    seed: int
+    spike_std: float
+    reduction_seed: int
+    threads: int
+
+
+# Which points ---------------------------------------------------------------------------------
+
+
+def grid_points(grid: Grid, *, full: bool, model: bool) -> list[str]:
+    """Return the points of the default grid.
+
+    Args:
+        grid: its levels. Ratio 0 is the same in every family: ``none:0``, once.
+        full: whether to go beyond MCAR, MAR and sensor reduction.
+        model: whether the agent has a model that can choose sensors.
+
+    Returns:
+        Points as text, in the order of evaluation.
+    """
+    ratios = [ratio for ratio in grid.ratios if ratio > 0]
+    points = ["none:0"] if len(ratios) < len(grid.ratios) else []
+    families = ("mcar", "mar", "nmar") if full else ("mcar", "mar")
+    points += [f"{family}:{ratio:g}" for family in families for ratio in ratios]
+    selections = ("model", "random") if model else ("random",)
+    points += [f"reduction:{ratio:g}:{by}" for by in selections for ratio in ratios]
+    if full:
+        points += [
+            f"outages:{ratio:g}:{length:g}:{by}"
+            for ratio in grid.outage_ratios
+            for by in grid.outage_groups
+            for length in grid.outage_lengths
+            # there is no chain that is off so much of the time and comes back so soon
+            if ratio < 1 and length >= max(1.0, ratio / (1 - ratio) - 1e-9)
+        ]
+        points += [f"noise:{sigma:g}" for sigma in grid.noise_sigmas]
+        points += [f"spikes:{probability:g}" for probability in grid.spike_probabilities]
+    return points
+
+
+def parse_points(texts: Sequence[str], settings: Settings, spike_std: float) -> list[Point]:
+    """Read points; one that comes twice, under two names perhaps, is one.
+
+    Args:
+        texts: see conf/evaluate.yaml.
+        settings: of the run.
+        spike_std: deviation of spikes where the text gives none, raw units.
+
+    Returns:
+        Different points.
+
+    Raises:
+        UserError: if one can't be read.
+    """
+    points = [parse_point(text, settings, spike_std=spike_std) for text in texts]
+    return list({point.name: point for point in points}.values())
+
+
+# What is done ---------------------------------------------------------------------------------
+
+
+class Results:
+    """The table of an evaluation: whole points, written whole after each.
+
+    Args:
+        path: CSV file; the points in it are kept.
+        protocol: how points are evaluated.
+        frames: of the checkpoint of each run.
+        overwrite: begin anew instead.
+
+    Raises:
+        UserError: if the file can't be continued: it is of another kind, of other settings, or
+            of another checkpoint.
+    """
+
+    def __init__(
+        self, path: Path, protocol: Protocol, frames: Mapping[str, int], *, overwrite: bool
+    ) -> None:
+        self.path, self.protocol = path, protocol
+        self._points: dict[tuple[str, str], list[Row]] = {}
+        if overwrite or not path.is_file():
+            return
+        again = "name another `output`, or overwrite=true begins anew."
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        if rows and not {"run", "point", "seed", "mode", "episode"} <= rows[0].keys():
+            raise UserError(f"`{path}` is no table of this command, or of an earlier one: {again}")
+        for row in rows:
+            self._points.setdefault((row["run"], row["point"]), []).append(row)
+        for (run, point), found in self._points.items():
+            for what, given, wanted in (
+                ("seed", {row["seed"] for row in found}, protocol.seed),
+                ("frames", {row["frames"] for row in found}, frames.get(run)),
+                ("episodes", {len(found) // len({row["mode"] for row in found})},
+                 protocol.episodes),
+            ):  # fmt: skip
+                if wanted is not None and {str(value) for value in given} != {str(wanted)}:
+                    raise UserError(
+                        f"`{path}` holds {run} at {point} with {what} "
+                        f"{', '.join(sorted(map(str, given)))}, and {wanted} is asked for: {again}"
+                    )
+
+    def lacks(self, run: str, point: Point) -> bool:
+        """Return whether a point of a run is to be evaluated.
+
+        Args:
+            run: name of its folder.
+            point: the point.
+        """
+        found = self._points.get((run, point.name), [])
+        return not set(self.protocol.modes) <= {row["mode"] for row in found}
+
+    def add(self, run: str, point: str, rows: Sequence[Row]) -> None:
+        """Enter the episodes of a point and write the table.
+
+        Args:
+            run: name of its folder.
+            point: its name.
+            rows: of every kind of action.
+        """
+        self._points[run, point] = list(rows)
+        self.write()
+
+    def arrange(self, order: Sequence[tuple[str, str]]) -> None:
+        """Put points into an order, so that the table does not tell in which they came.
+
+        Args:
+            order: runs and points; others that the table holds come first, as they are.
+        """
+        ranks = {key: rank for rank, key in enumerate(order)}
+        keys = sorted(self._points, key=lambda key: ranks.get(key, -1))
+        self._points = {key: self._points[key] for key in keys}
+
+    def write(self) -> None:
+        """Write the table whole, if there is anything to write."""
+        if rows := self.rows:
+            write_table(self.path, rows)
+
+    @property
+    def rows(self) -> list[Row]:
+        """Return one row an episode."""
+        return [row for rows in self._points.values() for row in rows]
+
+
+# Doing the rest -------------------------------------------------------------------------------
+
+
+def evaluate_point(folder: Path, point: Point, protocol: Protocol) -> list[dict[str, Any]]:
+    """Evaluate one run at one point.
+
+    Args:
+        folder: the run folder.
+        point: the point.
+        protocol: how.
+
+    Returns:
+        One row an episode and kind of action.
+    """
+    torch.set_num_threads(protocol.threads)
+    trained = agent_of(folder)
+    rows = []
+    for _, mode, result in evaluate_points(
+        trained,
+        [point],
+        episodes=protocol.episodes,
+        modes=protocol.modes,
+        seed=protocol.seed,
+        reduction_seed=protocol.reduction_seed,
+    ):
+        found = episode_rows(trained, point, mode, result, run=folder.name)
+        rows += [row | {"seed": protocol.seed} for row in found]
+    return rows
+
+
+@lru_cache(maxsize=1)
+def agent_of(folder: Path) -> TrainedAgent:
+    """Return a run's agent; the points of a run come one after the other and share it.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        Its last checkpoint.
+    """
+    return load_trained_agent(folder)
+
+
+def evaluate_tasks(
+    tasks: Sequence[tuple[Path, Point]], protocol: Protocol, processes: int
+) -> Iterator[tuple[Path, Point, list[dict[str, Any]]]]:
+    """Evaluate points of runs, several at a time; the numbers do not depend on how many.
+
+    Args:
+        tasks: run folders and points.
+        protocol: how.
+        processes: at a time; 1: in this process.
+
+    Yields:
+        Folder, point and rows, as they come.
+    """
+    processes = min(processes, len(tasks))
+    if processes <= 1:
+        agent_of.cache_clear()  # the folder may have got another checkpoint since
+        for folder, point in tasks:
+            yield folder, point, evaluate_point(folder, point, protocol)
+        return
+    # A fresh interpreter each: a fork would inherit torch's threads and half-held locks.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
+        futures = {pool.submit(evaluate_point, *task, protocol): task for task in tasks}
+        try:
+            for future in as_completed(futures):
+                yield *futures[future], future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone, even one that was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+
+        def watch() -> None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+        threading.Thread(target=watch, daemon=True).start()
