@@ -1,0 +1,185 @@
+"""What does the paper's constant predicted covariance cost, and how honest is it?
+
+A known linear system, four sensors with noise, and two filters that know everything about it but
+one thing: the exact filter propagates its covariance (P = A Sigma A' + Q), the other predicts with
+the same P at every step, as eq. (8) of the paper does, and that P is trained by likelihood on data
+with the same gaps. MSE of the state over the exact filter's; NEES / n and NIS / entries, 1 for a
+filter that is as sure as it should be. Sensors fail one by one, independently at every step or for
+20 steps on average, or all at once. Plus-minus: 1.96 standard errors over independent sequences.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from timing import finish, parser, start, table
+from torch import Tensor
+
+from torchrl_drbpn.functional import (
+    Belief,
+    MeanNetwork,
+    StateSpace,
+    filter_sequence,
+    full_cov,
+    innovation,
+    normalised_squared,
+    outage_rates,
+    predict,
+    sample_working,
+    update,
+)
+
+STATE, MIN_STD = 4, 1e-3
+CASES = {
+    "each sensor, 50 % of the steps, independent": (0.5, 2.0, False),
+    "each sensor, 50 %, outages of mean length 20": (0.5, 20.0, False),
+    "all sensors at once, 50 %, mean length 20": (0.5, 20.0, True),
+}
+
+
+def system() -> StateSpace:
+    """Build two damped oscillators that pull at each other, seen component by component."""
+
+    def turn(angle: float) -> Tensor:
+        c, s = math.cos(angle), math.sin(angle)
+        return torch.tensor([[c, s], [-s, c]], dtype=torch.float64)
+
+    A = torch.block_diag(0.96 * turn(0.3), 0.93 * turn(0.8))
+    A[0, 3] = A[2, 1] = 0.05
+    eye = torch.eye(STATE, dtype=torch.float64)
+    Q, R = 0.3**2 * eye, torch.full((STATE,), 0.2**2, dtype=torch.float64)
+    stationary = Q.clone()
+    for _ in range(1000):
+        stationary = A @ stationary @ A.mT + Q
+    zero = torch.zeros(STATE, dtype=torch.float64)
+    weight = torch.cat([A, torch.zeros(STATE, 1, dtype=torch.float64)], -1)
+    f = MeanNetwork((weight,), (zero,), False, "relu")
+    return StateSpace(f, Q, eye, R, torch.zeros(STATE, 1, dtype=torch.float64), zero, zero,
+                      stationary)  # fmt: skip
+
+
+def dynamics(model: StateSpace) -> Tensor:
+    """Return A."""
+    assert isinstance(model.transition, MeanNetwork)
+    return model.transition.weights[0][:, :STATE]
+
+
+def simulate(
+    model: StateSpace, case: tuple[float, float, bool], rows: int, time: int, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw states, observations and masks, each (rows, time, ...)."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(cov: Tensor) -> Tensor:
+        noise = torch.randn(rows, STATE, generator=g, dtype=torch.float64)
+        return noise @ torch.linalg.cholesky(cov).mT
+
+    eta, length, together = case
+    rates = outage_rates(eta, length)
+    like = torch.zeros(rows, 1 if together else STATE)
+    A, R = dynamics(model), model.full_emission_cov()
+    state, working = normal(model.initial_cov), sample_working(None, rates, like, g)
+    states, seen, masks = [], [], []
+    for t in range(time):
+        if t:
+            assert isinstance(model.transition_cov, Tensor)
+            state = state @ A.mT + normal(model.transition_cov)
+            working = sample_working(working, rates, like, g)
+        states.append(state)
+        seen.append(state + normal(R))
+        masks.append(working.expand(rows, STATE))
+    return torch.stack(states, 1), torch.stack(seen, 1), torch.stack(masks, 1)
+
+
+def trained_cov(
+    model: StateSpace, observation: Tensor, observed: Tensor, iterations: int
+) -> Tensor:
+    """Return the constant P under which what arrived is likeliest."""
+    assert isinstance(model.transition_cov, Tensor)
+    raw = torch.linalg.cholesky(model.transition_cov).requires_grad_()
+    optimiser = torch.optim.Adam([raw], lr=0.05)
+    rows, time = observed.shape[:2]
+    reset = torch.zeros(rows, time, dtype=torch.bool)
+    reset[:, 0] = True
+    action = torch.zeros(rows, time, 1, dtype=torch.float64)
+    for _ in range(iterations):
+        learned = model._replace(transition_cov=full_cov(raw, MIN_STD))
+        out = filter_sequence(learned, model.initial_mean, action, observation, observed, reset)
+        optimiser.zero_grad()
+        (-out.log_likelihood.sum() / observed.sum()).backward()
+        optimiser.step()
+    return full_cov(raw, MIN_STD).detach()
+
+
+def judge(
+    model: StateSpace, cov: Tensor | None, state: Tensor, observation: Tensor, observed: Tensor
+) -> dict[str, Tensor]:
+    """Filter with a constant P, or exactly, and return sums for each sequence."""
+    rows, time = observed.shape[:2]
+    A, R = dynamics(model), model.full_emission_cov()
+    Q = model.transition_cov if cov is None else cov
+    assert isinstance(Q, Tensor)
+    action, zero = torch.zeros(rows, 1, dtype=torch.float64), model.emission_offset
+    belief = Belief(
+        model.initial_mean.expand(rows, -1), model.initial_cov.expand(rows, STATE, STATE)
+    )
+    sums = {name: torch.zeros(rows, dtype=torch.float64) for name in ("se", "nees", "nis", "dof")}
+    for t in range(time):
+        if t:
+            belief = predict(
+                belief, lambda m, _: m @ A.mT, Q, action, jacobian=A if cov is None else None
+            )
+        seen = observed[:, t]
+        given = (observation[:, t], seen, model.emission_matrix, R, zero.expand(rows, -1))
+        sums["nis"] += normalised_squared(*innovation(belief, *given), seen)
+        sums["dof"] += seen.sum(-1)
+        belief = update(belief, *given)
+        error = state[:, t] - belief.mean
+        sums["se"] += error.square().sum(-1)
+        sums["nees"] += normalised_squared(error, belief.cov)
+    return sums | {"entries": torch.full((rows,), float(STATE * time), dtype=torch.float64)}
+
+
+def ratio(numerator: Tensor, denominator: Tensor) -> tuple[float, float]:
+    """Return a ratio of sums over sequences and 1.96 standard errors of it."""
+    value = numerator.sum() / denominator.sum()
+    rest = numerator - value * denominator
+    error = rest.std() * math.sqrt(len(rest)) / denominator.sum()
+    return value.item(), 1.96 * error.item()
+
+
+def main() -> None:
+    """Run from the command line."""
+    args = parser(__doc__ or "").parse_args()
+    run = start(args)
+    rows, time, iterations = (8, 20, 3) if args.quick else (200, 200, 200)
+    model = system()
+    results: dict[str, dict[str, tuple[float, float]]] = {}
+    for name, case in CASES.items():
+        _, observation, observed = simulate(model, case, rows, time, seed=0)
+        cov = trained_cov(model, observation, observed, iterations)
+        data = simulate(model, case, rows, time, seed=1)
+        exact, constant = judge(model, None, *data), judge(model, cov, *data)
+        results[name] = {
+            "mse": ratio(constant["se"], exact["se"]),
+            "nees constant": ratio(constant["nees"], constant["entries"]),
+            "nees exact": ratio(exact["nees"], exact["entries"]),
+            "nis constant": ratio(constant["nis"], constant["dof"]),
+            "nis exact": ratio(exact["nis"], exact["dof"]),
+        }
+    for title, keys in {
+        "state MSE, constant over exact": ("mse",),
+        "NEES / n": ("nees constant", "nees exact"),
+        "NIS / entries": ("nis constant", "nis exact"),
+    }.items():
+        columns = [c for key in keys for c in (key.split()[-1], "+-")]
+        lines = [
+            (name, *(v for key in keys for v in found[key])) for name, found in results.items()
+        ]
+        table(title, ("sensors fail", *columns), lines)
+    finish(args, run, results)
+
+
+if __name__ == "__main__":
+    main()
