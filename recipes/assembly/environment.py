@@ -34,7 +34,7 @@ from torchrl_drbpn import (
     SensorOutages,
     seed_env,
 )
-from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv, LeanTransformedEnv
 
 _MECHANISMS: dict[str, Literal["mcar", "mar", "nmar"]] = {
     "mcar": "mcar",
@@ -108,7 +108,7 @@ def make_environment(
         StepCounter(),
         InitTracker(),
     ]
-    out = TransformedEnv(base, Compose(*transforms))
+    out = LeanTransformedEnv(base, Compose(*transforms))
     seed_env(out, seed)
     return out
 

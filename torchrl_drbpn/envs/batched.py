@@ -17,6 +17,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_drbpn.envs.stepping import Plan
+
 __all__ = ["NO_SEED", "BatchedSimulators"]
 
 NO_SEED = -1
@@ -48,6 +50,7 @@ class BatchedSimulators(EnvBase):
 
     # A frame skip belongs to the simulator: TorchRL must not add its own.
     _has_frame_skip = True
+    _plan: Plan | None = None
     _obs_dim: int
     _action_low: NDArray[Any]
     _action_high: NDArray[Any]
@@ -152,6 +155,20 @@ class BatchedSimulators(EnvBase):
 
     # Stepping -------------------------------------------------------------------------------
 
+    def empty_cache(self) -> None:
+        """Forget what was derived from the specs."""
+        super().empty_cache()
+        self._plan = None
+
+    def _step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        if self._plan is None:
+            self._plan = Plan(self, self)
+        if self._plan.usable and self._plan.takes(tensordict):
+            return self._plan(tensordict)
+        return super()._step_and_maybe_reset(tensordict)
+
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not self._all_started:
             row = int(np.flatnonzero(~self._started)[0])
@@ -211,16 +228,21 @@ class BatchedSimulators(EnvBase):
         truncated: NDArray[np.bool_],
         reward: NDArray[np.float64] | None = None,
     ) -> TensorDict:
-        device, dtype = self.device, self.dtype
-        # `observation` is kept as the row memory, so that float64 needs a copy of its own.
+        # `observation` is kept as the row memory, so that it always has to be copied.
+        float32 = self.dtype is torch.float32
+        kind = np.float32 if float32 else np.float64
         source = {
-            "observation": torch.from_numpy(observation).to(device, dtype, copy=True),
+            "observation": torch.from_numpy(observation.astype(kind)),
             "done": torch.from_numpy(terminated | truncated),
             "terminated": torch.from_numpy(terminated),
             "truncated": torch.from_numpy(truncated),
         }
         if reward is not None:
-            source["reward"] = torch.from_numpy(reward).to(device, dtype)
+            source["reward"] = torch.from_numpy(reward.astype(kind, copy=False))
+        device = self.device
+        if device is None or device.type == "cpu":
+            # The shapes are known: checking them costs as much as all of the above.
+            return TensorDict._new_unsafe(source, batch_size=self.batch_size, device=device)
         return TensorDict(source, batch_size=self.batch_size, device=device)
 
     def _set_seed(self, seed: int | None) -> None:

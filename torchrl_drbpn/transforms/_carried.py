@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
-from torchrl_drbpn.transforms._common import OrderedTransform, read
+from torchrl_drbpn.transforms._common import OrderedTransform, fetch, read
 
 __all__ = ["CarriedTransform", "clear_rows", "flagged_rows", "spread_rows"]
 
@@ -29,12 +29,12 @@ def flagged_rows(tensordict: TensorDictBase, name: str, key: NestedKey) -> Tenso
     folders = key[:-1] if isinstance(key, tuple) else ()
     for depth in range(len(folders), -1, -1):
         flag_key = (*folders[:depth], name) if depth else name
-        flag = tensordict.get(flag_key, None)
+        flag = fetch(tensordict, flag_key)
         if flag is not None:
             batch_dims = tensordict.ndim
-            if flag.ndim > batch_dims:
-                flag = flag.flatten(batch_dims).any(-1)
-            return cast(Tensor, flag)
+            if flag.ndim == batch_dims + 1 and flag.shape[-1] == 1:
+                return flag.squeeze(-1)
+            return flag.flatten(batch_dims).any(-1) if flag.ndim > batch_dims else flag
     return None
 
 

@@ -17,10 +17,12 @@ from torchrl.data import TensorSpec
 from torchrl_drbpn.transforms._common import (
     OrderedTransform,
     as_key_list,
+    fetch,
     observation_leaf,
     pair_keys,
     read,
     set_mask_spec,
+    store,
     unbounded_like,
 )
 
@@ -222,20 +224,20 @@ class CorruptingTransform(OrderedTransform):
         if len(self.in_keys) > 1:
             return self._run_many(tensordict, root)
         key, mask_key = self.in_keys[0], self.mask_keys[0]
-        observation = tensordict.get(key, None)
+        observation = fetch(tensordict, key)
         if observation is None:
             if self.missing_tolerance:
                 return tensordict
             observation = read(tensordict, key, self)
-        observed = tensordict.get(mask_key, None)
+        observed = fetch(tensordict, mask_key)
         if observed is not None:
             self._check_mask(observed, observation, mask_key)
         corrupted, observed = self._corrupt(observation, observed, root, tensordict)
         if self.complete_keys:
-            tensordict.set(self.complete_keys[0], observation)
-        tensordict.set(key, corrupted)
-        if self.writes_mask:
-            tensordict.set(mask_key, observed)
+            store(tensordict, self.complete_keys[0], observation)
+        store(tensordict, key, corrupted)
+        if self.writes_mask and observed is not None:
+            store(tensordict, mask_key, observed)
         return tensordict
 
     def _run_many(self, tensordict: TensorDictBase, root: TensorDictBase | None) -> TensorDictBase:

@@ -15,9 +15,11 @@ from torchrl_drbpn.transforms._carried import flagged_rows, spread_rows
 from torchrl_drbpn.transforms._common import (
     Role,
     as_key_list,
+    fetch,
     observation_leaf,
     pair_keys,
     read,
+    store,
     transform_chain,
     unbounded_like,
 )
@@ -142,7 +144,7 @@ class MaskedObservationNorm(RunningScaleTransform):
         for index, key in enumerate(self.in_keys):
             value = read(tensordict, key, self)
             moments = self._moments_for(index, value, tensordict.ndim)
-            observed = tensordict.get(self.mask_keys[index], None)
+            observed = fetch(tensordict, self.mask_keys[index])
             if observed is not None and (
                 observed.dtype is not torch.bool or observed.shape != value.shape
             ):
@@ -167,11 +169,11 @@ class MaskedObservationNorm(RunningScaleTransform):
             scaled = self._normalise(double, moments)
             if observed is not None and not self._filled[index]:
                 scaled.masked_fill_(~observed, 0.0)
-            tensordict.set(self.out_keys[index], scaled.to(value.dtype))
-            complete = tensordict.get(self.complete_keys[index], None)
+            store(tensordict, self.out_keys[index], scaled.to(value.dtype))
+            complete = fetch(tensordict, self.complete_keys[index])
             if complete is not None:
                 scaled = self._normalise(complete.double(), moments)
-                tensordict.set(self.complete_keys[index], scaled.to(complete.dtype))
+                store(tensordict, self.complete_keys[index], scaled.to(complete.dtype))
         return tensordict
 
     def _normalise(self, value: Tensor, moments: RunningMoments) -> Tensor:

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 from torchrl_drbpn.transforms._carried import CarriedTransform, clear_rows
-from torchrl_drbpn.transforms._common import Role, as_key_list, pair_keys, read
+from torchrl_drbpn.transforms._common import Role, as_key_list, fetch, pair_keys, read, store
 
 __all__ = ["PreviousAction"]
 
@@ -62,17 +62,17 @@ class PreviousAction(CarriedTransform):
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         for key, chosen in zip(self.in_keys, self._chosen, strict=True):
-            action = tensordict.get(key, None)
+            action = fetch(tensordict, key)
             if action is not None:
-                tensordict.set(chosen, action)
+                store(tensordict, chosen, action)
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         for key, out_key, chosen in zip(self.in_keys, self.out_keys, self._chosen, strict=True):
-            action = tensordict.get(chosen, None)
+            action = fetch(tensordict, chosen)
             if action is None:
                 action = read(tensordict, key, self)
-            next_tensordict.set(out_key, action)
+            store(next_tensordict, out_key, action)
         return next_tensordict
 
     def _reset(
@@ -81,7 +81,7 @@ class PreviousAction(CarriedTransform):
         del tensordict
         # Every row: the environment keeps the old values of the rows that are not reset.
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            tensordict_reset.set(out_key, self._zero(key, tensordict_reset))
+            store(tensordict_reset, out_key, self._zero(key, tensordict_reset))
         return tensordict_reset
 
     def _reset_on_native_autoreset(

@@ -15,7 +15,15 @@ from torchrl_drbpn.transforms._carried import (
     flagged_rows,
     spread_rows,
 )
-from torchrl_drbpn.transforms._common import Role, as_key_list, pair_keys, read, unbounded_like
+from torchrl_drbpn.transforms._common import (
+    Role,
+    as_key_list,
+    fetch,
+    pair_keys,
+    read,
+    store,
+    unbounded_like,
+)
 from torchrl_drbpn.transforms._running import RunningMoments, RunningScaleTransform
 
 __all__ = ["RunningReturnScale"]
@@ -102,14 +110,14 @@ class RunningReturnScale(CarriedTransform, RunningScaleTransform):
         scaled = reward * moments.inverse_scale
         if self.clip is not None:
             scaled = scaled.clamp_(-self.clip, self.clip)
-        tensordict.set(self.out_keys[index], scaled.to(reward.dtype))
+        store(tensordict, self.out_keys[index], scaled.to(reward.dtype))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         for index, key in enumerate(self.in_keys):
             reward = read(next_tensordict, key, self)
             moments = self._moments_for(index, reward, next_tensordict.ndim)
             state_key = self.state_keys[index]
-            previous = tensordict.get(state_key, None)
+            previous = fetch(tensordict, state_key)
             discounted = reward if previous is None else previous * self.gamma + reward
             if not self._frozen:
                 rows = flagged_rows(tensordict, "_step", key)
@@ -120,7 +128,7 @@ class RunningReturnScale(CarriedTransform, RunningScaleTransform):
                         "later reward by it; look at the environment's reward."
                     )
             self._write(next_tensordict, index, reward, moments)
-            next_tensordict.set(state_key, discounted)
+            store(next_tensordict, state_key, discounted)
         return next_tensordict
 
     def _reset(
@@ -130,7 +138,7 @@ class RunningReturnScale(CarriedTransform, RunningScaleTransform):
         self._check_collector()
         # Every row: the environment keeps the old values of the rows that are not reset.
         for key, state_key in zip(self.in_keys, self.state_keys, strict=True):
-            tensordict_reset.set(state_key, self._zero(key, tensordict_reset))
+            store(tensordict_reset, state_key, self._zero(key, tensordict_reset))
         return tensordict_reset
 
     def _reset_on_native_autoreset(
