@@ -9,11 +9,15 @@ from typing import Any, Self, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torchrl.envs import EnvBase, Transform
 
-from torchrl_drbpn.functional.statistics import Moments, masked_moments, merge_moments, variance
+from torchrl_drbpn.functional.statistics import Moments, masked_moments, variance
 from torchrl_drbpn.transforms._common import OrderedTransform
 
 __all__ = ["RunningMoments", "RunningScaleTransform"]
+
+# Under two samples `variance` gives 1.
+_ENOUGH = 2.0
 
 
 class RunningMoments(nn.Module):
@@ -34,6 +38,8 @@ class RunningMoments(nn.Module):
     def __init__(self, eps: float) -> None:
         super().__init__()
         self.eps = eps
+        # Once every component has been seen twice its variance needs no special case any more.
+        self._settled = False
         for name in ("count", "mean", "m2"):
             self.register_buffer(name, torch.zeros(0, dtype=torch.float64))
         # Derived, hence not saved: what the hot path multiplies with.
@@ -77,19 +83,39 @@ class RunningMoments(nn.Module):
             shape = (-1, *count.shape)
             value = value.reshape(shape)
             observed = None if observed is None else observed.reshape(shape)
-        batch = masked_moments(value, observed)
+        if observed is None:
+            batch = masked_moments(value)
+        else:
+            # masked_moments, operation by operation, without its checks and with fewer copies: at
+            # every step of every environment the number of operations is what is paid for.
+            weight = observed.double()
+            n = weight.sum(0)
+            filled = value.double().masked_fill(observed.logical_not(), 0.0)
+            mean = filled.sum(0).div_(n.clamp_min(1.0))
+            deviation = filled.sub_(mean).mul_(weight)
+            batch = Moments(n, mean, torch.linalg.vecdot(deviation, deviation, dim=0))
         # One scalar leaves the device. It is worth it: a single NaN would spoil the mean for good.
         if not math.isfinite(batch.m2.sum().item()):
             return False
-        old = Moments(count, cast(Tensor, buffers["mean"]), cast(Tensor, buffers["m2"]))
-        self._store(merge_moments(old, batch))
+        # merge_moments likewise; the batch's own tensors are written over.
+        total = count + batch.n
+        delta = batch.mean.sub_(cast(Tensor, buffers["mean"]))
+        share = batch.n.div_(total if self._settled else total.clamp_min(1.0))
+        shift = share.mul_(delta)
+        m2 = batch.m2.add_(cast(Tensor, buffers["m2"])).addcmul_(delta.mul_(count), shift)
+        self._store(Moments(total, shift.add_(cast(Tensor, buffers["mean"])), m2))
         return True
 
     def _store(self, moments: Moments) -> None:
         # Straight into the dictionary: nn.Module's own __setattr__ costs as much as the arithmetic.
         buffers = self._buffers
         buffers["count"], buffers["mean"], buffers["m2"] = moments
-        buffers["inverse_scale"] = (variance(moments) + self.eps).rsqrt_()
+        if self._settled:
+            scale = moments.m2 / moments.n
+        else:
+            scale = variance(moments)
+            self._settled = moments.n.numel() > 0 and bool(moments.n.amin() >= _ENOUGH)
+        buffers["inverse_scale"] = scale.add_(self.eps).rsqrt_()
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
@@ -98,6 +124,7 @@ class RunningMoments(nn.Module):
         saved = state_dict.get(prefix + "count")
         if saved is not None:
             # New tensors, so that a state_dict taken earlier is not written over.
+            self._settled = False
             shape = self.count.shape if self.count.numel() else saved.shape
             self._store(Moments(*self.count.new_zeros(3, *shape)))
             if not saved.numel():
@@ -135,8 +162,18 @@ class RunningScaleTransform(OrderedTransform):
         self.clip = clip
         self.eps = eps
         self._frozen = False
+        self._collector_checked = False
         self._running = [RunningMoments(eps) for _ in self.in_keys]
         self.moments = nn.ModuleList(self._running)
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Attach the transform after checking the order rules.
+
+        Args:
+            container: the environment or the `Compose` that takes the transform.
+        """
+        super().set_container(container)
+        self._collector_checked = False
 
     @property
     def frozen(self) -> bool:
@@ -191,9 +228,11 @@ class RunningScaleTransform(OrderedTransform):
 
     def _check_collector(self) -> None:
         # A collector in a worker process knows its index; one in the main process has None.
-        if self._frozen:
+        if self._frozen or self._collector_checked:
             return
         collector = getattr(self.container, "collector", None)
+        # Looking it up goes through every wrapper of the environment: once a container is enough.
+        self._collector_checked = collector is not None
         if getattr(collector, "worker_idx", None) is not None:
             raise RuntimeError(
                 f"{type(self).__name__} cannot learn in the worker processes of a multi-process "

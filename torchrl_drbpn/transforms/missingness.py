@@ -20,7 +20,7 @@ from torchrl_drbpn.functional.corruption import (
     sample_observed,
 )
 from torchrl_drbpn.functional.gaussian import zero_missing
-from torchrl_drbpn.transforms._common import Role, as_key_list
+from torchrl_drbpn.transforms._common import Role, as_key_list, fetch
 from torchrl_drbpn.transforms._corrupting import (
     CorruptingTransform,
     SeededTransform,
@@ -147,11 +147,11 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
             probability = missing_probability(parameters, observation, action, self._eta)
         arrived = sample_observed(probability, observation, self.generator(observation.device))
         if observed is not None:
-            arrived = arrived & observed
-        return zero_missing(observation, arrived), arrived
+            arrived = arrived.logical_and_(observed)
+        return torch.where(arrived, observation, 0.0), arrived
 
     def _action(self, root: TensorDictBase, observation: Tensor) -> Tensor:
-        action = root.get(self.action_key, None)
+        action = fetch(root, self.action_key)
         if action is None:
             raise KeyError(
                 f"`{type(self).__name__}` with mechanism {self.mechanism!r} reads the action under "
@@ -163,7 +163,8 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
                 f"{tuple(observation.shape[:-1])}, got {tuple(action.shape)}. Mechanism "
                 f'{self.mechanism!r} weighs its components; use "mcar" for other actions.'
             )
-        cast: Tensor = action.to(observation.dtype)
+        same = action.dtype is observation.dtype
+        cast: Tensor = action if same else action.to(observation.dtype)
         return cast
 
     # ------------------------------------------------------------------ the mechanism's parameters

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, Transform
 
-from torchrl_drbpn.transforms._carried import flagged_rows, spread_rows
+from torchrl_drbpn.transforms._carried import flagged_rows
 from torchrl_drbpn.transforms._common import (
     Role,
     as_key_list,
@@ -158,8 +158,8 @@ class MaskedObservationNorm(RunningScaleTransform):
                 rows = flagged_rows(cast(TensorDictBase, flags), flag, key)
                 counted = observed
                 if rows is not None:
-                    rows = spread_rows(rows, value)
-                    counted = rows if observed is None else observed & rows
+                    rows = rows.unsqueeze(-1)
+                    counted = rows.expand_as(value) if observed is None else observed & rows
                 if not moments.learn(double, counted):
                     raise ValueError(
                         f"`{key}` holds NaN or an infinity where {self.mask_keys[index]!r} says "
@@ -168,7 +168,7 @@ class MaskedObservationNorm(RunningScaleTransform):
                     )
             scaled = self._normalise(double, moments)
             if observed is not None and not self._filled[index]:
-                scaled.masked_fill_(~observed, 0.0)
+                scaled.masked_fill_(observed.logical_not(), 0.0)
             store(tensordict, self.out_keys[index], scaled.to(value.dtype))
             complete = fetch(tensordict, self.complete_keys[index])
             if complete is not None:
