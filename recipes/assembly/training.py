@@ -15,6 +15,7 @@ from torchrl.objectives.value import GAE
 from assembly.agent import COMPLETE, Agent, add_primers
 from assembly.algorithms import Algorithm, build_algorithm
 from assembly.beliefs import Belief, build_belief
+from assembly.decision import RolloutPolicy
 from assembly.environment import make_environment, task_dims
 from assembly.errors import UserError
 from assembly.rollout import (
@@ -90,14 +91,16 @@ def assemble(settings: Settings) -> Training:
         complete=COMPLETE in agent.critic.in_keys,
     )
     add_primers(env, agent)
+    policy = RolloutPolicy(agent)
     collector = Collector(
         env,
-        agent.policy,
+        policy,
         frames_per_batch=settings.collector.frames,
         total_frames=-1,
         track_traj_ids=False,
         use_buffers=False,
         auto_register_policy_transforms=False,
+        pre_collect_hook=policy.refresh,
     )
     return Training(
         belief=belief,

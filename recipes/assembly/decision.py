@@ -1,0 +1,99 @@
+"""The decisions of a rollout: belief module, policy head, sample and log-probability in one call."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import InteractionType, TensorDictModuleBase
+from tensordict.nn.probabilistic import interaction_type
+from torch import Tensor, nn
+
+from assembly.agent import Agent
+
+_LOG_SQRT_2PI = math.log(math.sqrt(2 * math.pi))
+
+
+class _Spread(NamedTuple):
+    """Hold the scale of the policy's Gaussian and what its density needs of it."""
+
+    scale: Tensor
+    twice_variance: Tensor
+    log_scale: Tensor
+
+
+class RolloutPolicy(TensorDictModuleBase):
+    r"""Write what ``agent.policy`` writes, bit for bit, without the objects around it.
+
+    With loc and scale of the head and eps ~ N(0, 1) from the global generator:
+
+    .. math::
+        a = loc + eps \cdot scale, \qquad
+        \log \pi(a) = \sum_i -\frac{(a_i - loc_i)^2}{2 scale_i^2} - \log scale_i - \log\sqrt{2\pi}
+
+    A ``ProbabilisticActor`` builds a distribution, checks its parameters and looks up keys at
+    every step, which costs several times what the networks do for sixteen robots. It still decides
+    where actions are not sampled (``set_exploration_type``), where gradients are wanted, and where
+    a log-probability is not finite, so that its own error says why.
+
+    Args:
+        agent: whose modules decide.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        self.belief, self.actor = agent.belief, agent.actor
+        self.in_keys, self.out_keys = list(agent.policy.in_keys), list(agent.policy.out_keys)
+        # In a plain dictionary: nn.Module's attributes cost a microsecond each.
+        self.__dict__["_layers"] = list(agent.location)
+        self.__dict__["_widen"] = agent.scale
+        self.__dict__["_spread"] = None
+
+    _layers: list[nn.Module]
+    _widen: nn.Module
+    _spread: _Spread | None
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Forget what was computed from the parameters; to be called when they have changed."""
+        self.__dict__["_spread"] = None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the belief, the action, its distribution and its log-probability.
+
+        Args:
+            tensordict: root entries of the environment.
+
+        Returns:
+            The same tensordict.
+        """
+        tensordict = self.belief(tensordict)
+        if torch.is_grad_enabled() or interaction_type() is not InteractionType.RANDOM:
+            decided: TensorDictBase = self.actor(tensordict)
+            return decided
+        loc: Tensor = tensordict._get_str("features", None)
+        for layer in self._layers:
+            if isinstance(layer, nn.Linear):
+                loc = nn.functional.linear(loc, layer.weight, layer.bias)
+            else:
+                loc = layer(loc)
+        spread = self._spread
+        if spread is None or spread.scale.shape != loc.shape:
+            _, scale = self._widen(loc)
+            spread = self.__dict__["_spread"] = _Spread(scale, 2 * scale**2, scale.log())
+        # The order of operations is that of torch.distributions.Normal: rsample, then log_prob.
+        action = torch.empty_like(loc).normal_().mul_(spread.scale).add_(loc)
+        log_prob = (action - loc).square_().neg_().div_(spread.twice_variance)
+        log_prob = log_prob.sub_(spread.log_scale).sub_(_LOG_SQRT_2PI).sum(-1)
+        if not math.isfinite(log_prob.sum().item()):
+            return self.actor(tensordict)
+        for key, value in (
+            ("loc", loc),
+            ("scale", spread.scale),
+            ("action", action),
+            ("action_log_prob", log_prob),
+        ):
+            tensordict._set_str(key, value, validated=True, inplace=False, non_blocking=False)
+        return tensordict
