@@ -16,10 +16,11 @@ import torch
 from assembly.belief_figure import save_figure
 from assembly.console import run_or_explain, say
 from assembly.errors import UserError
-from assembly.report_runs import find_folders, point_name
+from assembly.report_runs import find_folders
 from assembly.run_folder import write_table
 from assembly.sensor_choice import SensorModel, learned_sensors
 from assembly.sensor_figures import covariance_figure, ranking_figure
+from assembly.settings import missingness_name
 from assembly.trained import TrainedAgent, load_trained_agent
 from omegaconf import DictConfig, OmegaConf
 
@@ -71,7 +72,7 @@ def _title(trained: TrainedAgent) -> str:
     """Name what the runs of one column have in common."""
     settings = trained.settings
     return (
-        f"{settings.env.env_id}\ntrained on {point_name(settings.missingness)}, "
+        f"{settings.env.env_id}\ntrained on {missingness_name(settings.missingness)}, "
         f"sigma {settings.noise.sigma:g}"
     )
 
@@ -92,7 +93,7 @@ def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, An
     settings = trained.settings
     common = {
         "env": settings.env.env_id,
-        "trained_on": point_name(settings.missingness),
+        "trained_on": missingness_name(settings.missingness),
         "noise_sigma": settings.noise.sigma,
         "training_seed": settings.seed,
         "frames": trained.frames,

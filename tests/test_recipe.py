@@ -31,7 +31,7 @@ from assembly import run_folder
 from assembly.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from assembly.errors import UserError
 from assembly.evaluation import evaluate, make_evaluation_environment
-from assembly.points import episode_rows, evaluate_points, read_point
+from assembly.points import episode_rows, evaluate_points, parse_point, read_point
 from assembly.resume import resumed_config
 from assembly.run import run
 from assembly.run_folder import Table, read_config
@@ -154,8 +154,9 @@ def _copy(state: dict[str, Any]) -> Any:
     [
         ("belief=drbpn", "env=hopper", "missingness=mar"),
         ("belief=none", "missingness=nmar", "env=inverted_double_pendulum"),
+        ("missingness=outages", "missingness.group_by=joint", "noise=spikes"),
     ],
-    ids=["drbpn-hopper", "none-double-pendulum"],
+    ids=["drbpn-hopper", "none-double-pendulum", "drbpn-outages-spikes"],
 )
 def test_a_resumed_run_equals_one_that_never_stopped(
     overrides: tuple[str, ...], tmp_path: Path
@@ -303,7 +304,7 @@ def test_the_agent_read_back_repeats_the_final_evaluation(smoke: Path) -> None:
     final = [row for row in read_table(smoke / "evaluation.csv") if row["kind"] == "final"]
     found = evaluate_points(
         trained,
-        ["trained"],
+        [parse_point("trained", trained.settings, spike_std=1.0)],
         episodes=3,
         modes=["sampled", "mean"],
         seed=trained.settings.evaluation.seed,
@@ -317,13 +318,14 @@ def test_the_agent_read_back_repeats_the_final_evaluation(smoke: Path) -> None:
 
 def test_a_point_changes_what_is_missing_and_nothing_else(smoke: Path) -> None:
     trained = load_trained_agent(smoke)
-    points = evaluate_points(
-        trained, ["none:0", "mcar:1", "mcar:0.5"], episodes=4, modes=["mean"], seed=3
-    )
+    points = [
+        parse_point(text, trained.settings, spike_std=1.0)
+        for text in ("none:0", "mcar:1", "mcar:0.5")
+    ]
     ratios = []
-    for missingness, mode, result in points:
+    for point, mode, result in evaluate_points(trained, points, episodes=4, modes=["mean"], seed=3):
         ratios.append(result.missing_ratio)
-        rows = episode_rows(trained, missingness, mode, result)
+        rows = episode_rows(trained, point, mode, result)
         assert [row["episode"] for row in rows] == [0, 1, 2, 3]
         assert rows[0]["mechanism_seed"] == trained.settings.missingness.mechanism_seed
     assert ratios[:2] == [0.0, 1.0]
@@ -359,7 +361,13 @@ def test_the_commands_run_from_any_directory(tmp_path: Path) -> None:
     assert folder.name.startswith("inverted_pendulum-v5-drbpn-seed0-")
     assert not set("=,") & set(folder.name)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
-    words = (f"run={folder}", "points=[none:0,mcar:.5]", "episodes=2", "output=out.csv")
+    words = (
+        f"run={folder}",
+        "points=[none:0,mcar:.5]",
+        "episodes=2",
+        "output=out.csv",
+        "figures=false",
+    )
     done = command("evaluate.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(read_table(tmp_path / "out.csv")) == 2 * 2 * 2

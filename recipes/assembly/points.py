@@ -20,6 +20,7 @@ from assembly.settings import (
     Settings,
     check_mode,
     check_outages,
+    missingness_name,
 )
 from assembly.trained import TrainedAgent
 
@@ -128,21 +129,6 @@ def parse_point(text: str, settings: Settings, *, spike_std: float) -> Point:
             raise UserError(_READABLE.format(text)) from error
         raise
     return Point(missingness_name(read), read.mechanism, read, noise)
-
-
-def missingness_name(missingness: MissingnessSettings) -> str:
-    """Return missingness as a point, such as ``mcar:0.5`` or ``outages:0.5:20:sensor``.
-
-    Args:
-        missingness: mechanism, eta and, of outages, their length and groups.
-
-    Returns:
-        Text that :func:`read_point` reads back.
-    """
-    m = missingness
-    if m.mechanism == "outages":
-        return f"outages:{m.eta:g}:{m.mean_length:g}:{m.group_by}"
-    return f"{m.mechanism}:{0.0 if m.mechanism == 'none' else m.eta:g}"
 
 
 def _number(text: str, most: float = math.inf) -> float | None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from assembly.errors import UserError
 from assembly.run_folder import CELL_FILE, read_config
-from assembly.settings import MissingnessSettings, Settings, read_settings
+from assembly.settings import Settings, missingness_name, read_settings
 
 Row = dict[str, Any]
 # What may differ between the runs of one mean: it changes no number that is reported.
@@ -67,7 +67,7 @@ class StudyRun:
         return {
             "task": s.env.env_id,
             "method": self.method,
-            "trained_on": point_name(s.missingness),
+            "trained_on": missingness_name(s.missingness),
             "noise_sigma": s.noise.sigma,
         }
 
@@ -75,21 +75,6 @@ class StudyRun:
     def missing_ratio(self) -> float:
         """Return the share of entries that did not arrive in training."""
         return mean_of_known(row["missing_ratio"] for row in self.training)
-
-
-def point_name(missingness: MissingnessSettings) -> str:
-    """Return missingness as ``recipes/evaluate.py`` takes it, such as ``mcar:0.5``.
-
-    Args:
-        missingness: mechanism, eta and, of outages, their length and groups.
-
-    Returns:
-        ``mechanism:eta``, or ``outages:eta:mean_length:group_by``.
-    """
-    m = missingness
-    if m.mechanism == "outages":
-        return f"outages:{m.eta:g}:{m.mean_length:g}:{m.group_by}"
-    return f"{m.mechanism}:{0.0 if m.mechanism == 'none' else m.eta:g}"
 
 
 # Reading --------------------------------------------------------------------------------------
@@ -293,7 +278,7 @@ def _evaluations(folder: Path, settings: Settings) -> list[Row]:
     path = folder / "evaluation.csv"
     for row in _read_csv(path, {"frames", "kind", "mode", "return_mean"}) if path.is_file() else []:
         rows.append(
-            {"source": row["kind"], "point": point_name(settings.missingness)}
+            {"source": row["kind"], "point": missingness_name(settings.missingness)}
             | {key: row.get(key) for key in _EVALUATED}
         )
     path = folder / "points.csv"

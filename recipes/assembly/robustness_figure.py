@@ -213,10 +213,14 @@ def _realised_axis(axis: Any, curves: Sequence[Curve]) -> None:
     levels = sorted(realised)
     if curves[0].axis.startswith("mean outage") and levels[0] > 0:
         axis.set_xscale("log")
-        axis.minorticks_off()
+    elif curves[0].axis == "sigma":
+        axis.set_xscale("symlog", linthresh=1.0)
+    axis.minorticks_off()
     axis.set_xticks(levels, [f"{level:g}" for level in levels])
     above = axis.secondary_xaxis("top")
-    above.set_xticks(levels, [f"{_ratio(realised[level]):.2f}"[1:] for level in levels])
+    above.set_xticks(
+        levels, [f"{_ratio(realised[level]):.2f}".removeprefix("0") for level in levels]
+    )
     above.minorticks_off()
     above.tick_params(labelsize=8, colors="#5f6b73")
     above.set_xlabel("realised missing ratio", fontsize=8, color="#5f6b73")

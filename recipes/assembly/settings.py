@@ -339,6 +339,21 @@ def check_outages(missingness: MissingnessSettings) -> None:
         raise UserError(f"missingness=outages: {error}") from error
 
 
+def missingness_name(missingness: MissingnessSettings) -> str:
+    """Return missingness as a point, such as ``mcar:0.5`` or ``outages:0.5:20:sensor``.
+
+    Args:
+        missingness: mechanism, eta and, of outages, their length and groups.
+
+    Returns:
+        Text that :func:`assembly.points.read_point` reads back.
+    """
+    m = missingness
+    if m.mechanism == "outages":
+        return f"outages:{m.eta:g}:{m.mean_length:g}:{m.group_by}"
+    return f"{m.mechanism}:{0.0 if m.mechanism == 'none' else m.eta:g}"
+
+
 def check_mode(mode: str) -> None:
     """Check the name of a kind of action.
 

@@ -1,0 +1,391 @@
+"""The evaluation recipe: points, the grid, the table that grows point by point, the figures.
+
+A point names one thing and leaves the rest as in training; its full name reads back to itself. The
+table holds whole points: one that was stopped goes on, to the same bytes as one that was not, and
+never mixes settings. Sensors that fail together share a joint or a kind. The interval of a mean is
+that of its runs and episodes.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("hydra")
+from recipe_tools import ROOT, make_config  # isort: skip
+
+sys.path.insert(0, str(ROOT / "recipes"))
+import evaluate as recipe
+from assembly import evaluation_grid
+from assembly.errors import UserError
+from assembly.evaluation_grid import Grid, evaluate_tasks, grid_points
+from assembly.points import Point, evaluate_points, parse_point, removed_sensors
+from assembly.robustness_figure import draw_robustness, mean_interval, read_rows
+from assembly.run import run as train
+from assembly.sensor_groups import sensor_groups
+from assembly.sensors import named_tasks, sensor_names
+from assembly.settings import Settings, read_settings
+from assembly.trained import TrainedAgent, load_trained_agent
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+SMOKE = (
+    "experiment=smoke",
+    "missingness=mcar",
+    "missingness.eta=0.2",
+    "total_frames=128",
+    "evaluation.every_frames=0",
+    "evaluation.final_episodes=0",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _threads() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def trained_folder(folder: Path, *overrides: str) -> Path:
+    with torch.random.fork_rng(devices=[]):
+        assert train(make_config(*SMOKE, *overrides), folder) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drbpn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained_folder(tmp_path_factory.mktemp("runs") / "drbpn")
+
+
+@pytest.fixture(scope="module")
+def feedforward(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained_folder(tmp_path_factory.mktemp("runs") / "none", "belief=none")
+
+
+@pytest.fixture(scope="module")
+def agent(drbpn: Path) -> TrainedAgent:
+    return load_trained_agent(drbpn)
+
+
+@pytest.fixture(scope="module")
+def settings() -> Settings:
+    return read_settings(make_config(*SMOKE))
+
+
+def configured(*overrides: str) -> dict[str, Any]:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        composed = OmegaConf.to_container(compose("evaluate", list(overrides)), resolve=True)
+    assert isinstance(composed, dict)
+    return {str(key): value for key, value in composed.items()}
+
+
+def evaluate(output: Path, *runs: Path, points: str = "", **options: Any) -> list[dict[str, str]]:
+    base = configured(*([f"points=[{points}]"] if points else []))
+    base |= {"run": [str(r) for r in runs], "output": str(output), "processes": 1, "episodes": 2}
+    assert recipe.run(base | {"figures": False} | options) == 0
+    with output.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def parse(text: str, settings: Settings) -> Point:
+    return parse_point(text, settings, spike_std=5.0)
+
+
+# Points ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("trained", "mcar:0.2"),
+        ("none:0", "none:0"),
+        ("nmar:.5", "nmar:0.5"),
+        ("outages:0.5:20", "outages:0.5:20:sensor"),
+        ("outages:0.2:5:kind", "outages:0.2:5:kind"),
+        ("reduction:0.4:model", "reduction:0.4:model"),
+        ("noise:2", "noise:2"),
+        ("spikes:0.05", "spikes:0.05:5"),
+        ("spikes:0.05:2", "spikes:0.05:2"),
+    ],
+)
+def test_the_full_name_of_a_point_reads_back_to_it(
+    text: str, name: str, settings: Settings
+) -> None:
+    point = parse(text, settings)
+    assert point.name == name
+    assert parse(name, settings) == point
+
+
+def test_a_point_leaves_what_it_does_not_name_as_in_training(settings: Settings) -> None:
+    assert parse("noise:3", settings).missingness == settings.missingness
+    assert parse("spikes:0.1", settings).missingness == settings.missingness
+    for text in ("mar:0.5", "outages:0.5:20", "reduction:0.5:random"):
+        assert parse(text, settings).noise == settings.noise
+    spiked = parse("spikes:0.1:7", settings).noise
+    assert spiked == dataclasses.replace(settings.noise, spike_probability=0.1, spike_std=7.0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["fog:0.5", "outages:0.5", "outages:0.5:20:leg", "reduction:0.5", "reduction:0.5:luck", "noise",
+     "noise:-1", "spikes:1.5", "spikes:0.1:inf", "mcar:0.5:3", "reduction:1.2:model"],
+)  # fmt: skip
+def test_a_point_that_can_not_be_read_is_refused(text: str, settings: Settings) -> None:
+    with pytest.raises(UserError, match="`points` must hold trained or mechanism:eta") as error:
+        parse(text, settings)
+    assert repr(text) in str(error.value)
+
+
+def test_outages_that_no_chain_has_are_refused(settings: Settings) -> None:
+    with pytest.raises(UserError, match="`mean_length` must be at least eta"):
+        parse("outages:0.8:2", settings)
+
+
+def test_each_family_changes_what_the_agent_gets(agent: TrainedAgent) -> None:
+    texts = ("outages:0.5:3:kind", "reduction:0.5:random", "reduction:0.5:model", "spikes:1:5")
+    points = [parse(text, agent.settings) for text in ("noise:0", *texts)]
+    found = [
+        result
+        for _, _, result in evaluate_points(agent, points, episodes=20, modes=["sampled"], seed=1)
+    ]
+    ratios = [result.missing_ratio for result in found]
+    assert ratios[0] == pytest.approx(0.2, abs=0.06)  # as in training
+    assert ratios[1] == pytest.approx(0.5, abs=0.15)
+    assert ratios[2] == ratios[3] == 0.5  # 2 of 4 sensors
+    assert ratios[4] == pytest.approx(0.2, abs=0.06)
+    clean, spiked = found[0].log_likelihood, found[4].log_likelihood
+    assert clean is not None
+    assert spiked is not None
+    assert spiked < clean  # a reading that is 5 off is not what the model expects
+
+
+def test_random_reduction_is_the_same_for_every_agent_and_nested(
+    agent: TrainedAgent, feedforward: Path
+) -> None:
+    other = load_trained_agent(feedforward)
+    chosen = [
+        [
+            removed_sensors(parse(f"reduction:{ratio}:random", a.settings), a, 0)
+            for a in (agent, other)
+        ]
+        for ratio in (0.25, 0.5, 1.0)
+    ]
+    assert all(first == second for first, second in chosen)
+    assert [len(first) for first, _ in chosen] == [1, 2, 4]
+    assert set(chosen[0][0]) < set(chosen[1][0]) < set(chosen[2][0])
+    with pytest.raises(UserError, match="has learned no H, P and R"):
+        removed_sensors(parse("reduction:0.5:model", other.settings), other, 0)
+
+
+# The grid -------------------------------------------------------------------------------------
+
+
+def test_the_default_grid_is_that_of_the_paper_and_the_full_one_goes_beyond(
+    settings: Settings,
+) -> None:
+    grid = Grid(**configured()["grid"])
+    points = grid_points(grid, full=False, model=True)
+    assert points[0] == "none:0"
+    assert len(points) == 1 + 4 * 5
+    assert {p.split(":")[0] for p in points} == {"none", "mcar", "mar", "reduction"}
+    assert not any("model" in p for p in grid_points(grid, full=True, model=False))
+    everything = grid_points(grid, full=True, model=True)
+    assert set(points) < set(everything)
+    assert {"nmar:0.5", "outages:0.5:50:joint", "noise:30", "spikes:0.2"} < set(everything)
+    for point in everything:
+        parse(point, settings)
+
+
+def test_mean_lengths_that_no_chain_has_are_left_out_of_the_grid(settings: Settings) -> None:
+    grid = Grid([], [0.8], [1, 2, 4, 20], ["sensor"], [], [])
+    points = grid_points(grid, full=True, model=False)
+    assert points == ["outages:0.8:4:sensor", "outages:0.8:20:sensor"]
+    for point in points:
+        parse(point, settings)
+
+
+# The table ------------------------------------------------------------------------------------
+
+
+def test_one_row_an_episode_and_a_baseline_only_at_random(
+    drbpn: Path, feedforward: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = configured()["grid"] | {"ratios": [0, 0.5]}
+    rows = evaluate(tmp_path / "out.csv", drbpn, feedforward, grid=small)
+    points = {(row["run"], row["point"]) for row in rows}
+    assert len(points) == 5 + 4
+    assert ("drbpn", "reduction:0.5:model") in points
+    assert ("none", "reduction:0.5:model") not in points
+    assert "none: sensors are removed at random only" in capsys.readouterr().out
+    assert len(rows) == 9 * 2 * 2
+    assert {row["seed"] for row in rows} == {"10000"}
+    mcar = [row for row in rows if row["point"] == "mcar:0.5"]
+    assert {row["eta"] for row in mcar} == {"0.5"}
+    assert all(0.2 < float(row["missing_ratio"]) < 0.8 for row in mcar)
+
+
+def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = "none:0,'mcar:0.5','outages:0.5:4'"
+    whole, broken = tmp_path / "whole.csv", tmp_path / "broken.csv"
+    evaluate(whole, drbpn, points=points)
+    real, calls = evaluation_grid.evaluate_point, []
+
+    def dies(*args: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(evaluation_grid, "evaluate_point", dies)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(broken, drbpn, points=points)
+    with broken.open(newline="") as file:
+        assert {row["point"] for row in csv.DictReader(file)} == {"none:0"}
+    evaluate(broken, drbpn, points=points)
+    assert len(calls) == 2 + 2  # the finished point was not made again
+    assert broken.read_bytes() == whole.read_bytes()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_order_of_the_table_is_that_of_the_points_and_others_are_kept(
+    drbpn: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.csv"
+    evaluate(out, drbpn, points="'mcar:0.5'")
+    evaluate(out, drbpn, points="'mar:0.5'")
+    rows = evaluate(out, drbpn, points="none:0,'mar:0.5'")
+    assert list(dict.fromkeys(row["point"] for row in rows)) == ["mcar:0.5", "none:0", "mar:0.5"]
+
+
+def test_two_processes_give_the_numbers_of_one(
+    drbpn: Path, tmp_path: Path, settings: Settings
+) -> None:
+    one = evaluate(tmp_path / "one.csv", drbpn, points="none:0,'mcar:0.5'")
+    two = evaluate(tmp_path / "two.csv", drbpn, points="none:0,'mcar:0.5'", processes=2)
+    assert one == two
+    assert list(evaluate_tasks([], None, 2)) == []  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [({"episodes": 3}, "with episodes 2, and 3"), ({"seed": 5}, "with seed 10000, and 5")],
+)
+def test_a_table_of_other_settings_is_not_mixed_with(
+    drbpn: Path, tmp_path: Path, change: dict[str, int], what: str
+) -> None:
+    out = tmp_path / "out.csv"
+    evaluate(out, drbpn, points="none:0")
+    with pytest.raises(UserError, match=what):
+        evaluate(out, drbpn, points="none:0", **change)
+    rows = evaluate(out, drbpn, points="none:0", overwrite=True, **change)
+    assert len(rows) == 2 * change.get("episodes", 2)
+
+
+def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    out.write_text("frames,mechanism\n1,mcar\n")
+    with pytest.raises(UserError, match="no table of this command, or of an earlier one"):
+        evaluate(out, drbpn, points="none:0")
+    assert out.read_text() == "frames,mechanism\n1,mcar\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"run": None}, "`run` must name a run folder"),
+        ({"episodes": 0}, "`episodes` must be a whole number of at least 1"),
+        ({"processes": 0}, "`processes` must be a whole number"),
+        ({"modes": ["best"]}, "`modes` must hold sampled and mean"),
+        ({"modes": []}, "`modes` must hold sampled, mean or both"),
+        ({"output": "no/such/folder/x.csv"}, "`output` must lie in an existing folder"),
+    ],
+)
+def test_bad_settings_are_one_line(
+    drbpn: Path, tmp_path: Path, options: dict[str, Any], what: str
+) -> None:
+    with pytest.raises(UserError, match=what):
+        evaluate(tmp_path / "out.csv", drbpn, points="none:0", **options)
+
+
+# Sensors that fail together -------------------------------------------------------------------
+
+
+def test_groups_hold_every_component_once_in_every_named_task() -> None:
+    sizes = {("Reacher", "v4"): 11, ("Reacher", "v5"): 10}
+    for task, version in named_tasks():
+        for obs_dim in [sizes[task, version]] if (task, version) in sizes else range(4, 400):
+            try:
+                names = sensor_names(task, version, obs_dim)
+            except UserError:
+                continue
+            for by in ("joint", "kind"):
+                groups = sensor_groups(names, by)
+                assert groups is not None
+                assert sorted(i for group in groups for i in group) == list(range(obs_dim))
+                assert 1 < len(groups) < obs_dim, (task, by)
+
+
+def test_a_joint_is_its_angle_and_its_velocity_and_a_kind_all_positions() -> None:
+    names = sensor_names("Hopper", "v5", 11)
+    assert sensor_groups(names, "sensor") is None
+    joints = sensor_groups(names, "joint")
+    assert joints == [[0, 1, 5, 6, 7], [2, 8], [3, 9], [4, 10]]
+    assert sensor_groups(names, "kind") == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9, 10]]
+
+
+def test_groups_need_names() -> None:
+    with pytest.raises(UserError, match="goes by the names of the sensors"):
+        sensor_groups(["component 0", "component 1"], "joint")
+    with pytest.raises(UserError, match="`group_by` must be sensor, joint or kind"):
+        sensor_groups(["pole angle"], "leg")
+
+
+# Figures --------------------------------------------------------------------------------------
+
+
+def test_the_interval_of_a_mean_covers_it_95_times_in_100() -> None:
+    generator = np.random.default_rng(0)
+    hits = 0
+    for trial in range(300):
+        mean, low, high = mean_interval([generator.normal(3.0, 2.0, 30).tolist()], seed=trial)
+        assert low < mean < high
+        hits += low < 3.0 < high
+    # the percentile bootstrap of 30 values covers a little less than it says
+    assert 0.90 < hits / 300 < 0.98
+
+
+def test_the_interval_sees_the_spread_between_runs() -> None:
+    generator = np.random.default_rng(0)
+    same = generator.normal(0.0, 1.0, 30)
+    _, low, high = mean_interval([(same + shift).tolist() for shift in (-5.0, 0.0, 5.0)])
+    _, inner_low, inner_high = mean_interval([same.tolist()] * 3)
+    assert high - low > 5 * (inner_high - inner_low)
+
+
+def test_a_figure_has_a_panel_a_family_and_both_ratios(drbpn: Path, tmp_path: Path) -> None:
+    points = "none:0,'mcar:0.5','reduction:0.5:random','reduction:0.5:model','outages:0.5:2'"
+    out = tmp_path / "out.csv"
+    rows = evaluate(out, drbpn, points=points + ",'outages:0.5:9','noise:1'", figures=True)
+    assert (tmp_path / "out-InvertedPendulum-v5.png").is_file()
+    (figure,) = draw_robustness(read_rows(rows)).values()
+    titles = [axis.get_title(loc="left") for axis in figure.axes]
+    assert titles == ["MCAR", "sensor reduction", "outages, ratio 0.5"] * 2  # noise has one level
+    mcar = figure.axes[0]
+    assert mcar.get_xlabel() == "nominal missing ratio"
+    (above,) = mcar.child_axes
+    assert above.get_xlabel() == "realised missing ratio"
+    labels = [label.get_text() for label in above.get_xticklabels()]
+    realised = [row for row in rows if row["point"] == "mcar:0.5" and row["mode"] == "sampled"]
+    steps = sum(float(row["length"]) for row in realised)
+    missing = sum(float(row["length"]) * float(row["missing_ratio"]) for row in realised) / steps
+    assert labels == [".00", f"{missing:.2f}".removeprefix("0")]
