@@ -145,16 +145,14 @@ class StudyFolder:
         Raises:
             UserError: if another process has it.
         """
-        path = self.path / "locks" / "study"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        self._lock.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(self._lock, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            holder = os.pread(file, 32, 0).decode() or "unknown"
             os.close(file)
             raise UserError(
-                f"`{self.path}` is in use by another study.py (process {holder}): wait for it or "
+                f"`{self.path}` is in use by another study.py (process {self.process()}): wait or "
                 "stop it; dry_run=true shows how far it is."
             ) from error
         _write_pid(file, os.getpid())
@@ -180,25 +178,19 @@ class StudyFolder:
 
     def running(self, cell: Cell) -> bool:
         """Return whether a process works on a cell, of this study.py or of an earlier one."""
-        try:
-            file = os.open(self._lock_file(cell), os.O_RDONLY)
-        except FileNotFoundError:
-            return False
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        finally:
-            os.close(file)
-        return False
+        return _held(self._lock_file(cell))
+
+    def process(self) -> int | None:
+        """Return the study.py that works on this study, where one does."""
+        return _holder(self._lock)
 
     def process_of(self, cell: Cell) -> int | None:
         """Return the process that works on a cell, where one does and its number is known."""
-        try:
-            number = int(self._lock_file(cell).read_text())
-        except (OSError, ValueError):
-            return None
-        return number if self.running(cell) else None
+        return _holder(self._lock_file(cell))
+
+    @property
+    def _lock(self) -> Path:
+        return self.path / "locks" / "study"
 
     def _lock_file(self, cell: Cell) -> Path:
         return self.path / "locks" / f"{cell.name}.cell"
@@ -246,6 +238,30 @@ def write_process(file: int, process: int) -> None:
         process: its number.
     """
     _write_pid(file, process)
+
+
+def _held(path: Path) -> bool:
+    """Return whether a process holds a lock."""
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(file)
+    return False
+
+
+def _holder(path: Path) -> int | None:
+    """Return the process that holds a lock, where one does and its number is known."""
+    try:
+        number = int(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return number if _held(path) else None
 
 
 def _write_pid(file: int, process: int) -> None:
