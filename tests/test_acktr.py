@@ -178,7 +178,7 @@ def test_bad_settings_are_refused_in_one_line(override: str, line: str) -> None:
 
 def test_the_report_tells_it_from_ppo_and_names_its_command(smoke: Path) -> None:
     (study,) = read_study([smoke])
-    assert study.group["belief"] == "none (acktr)"
+    assert study.group["method"] == "none (acktr)"
     command = training_command(study)
     words = shlex.split(command)[2:]
     assert "algo=acktr" in words

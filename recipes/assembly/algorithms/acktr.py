@@ -43,8 +43,8 @@ class ACKTR:
         seed: int,
         *,
         desired_kl: float,
-        policy: Mapping[str, float],
-        critic: Mapping[str, float],
+        policy: Mapping[str, Any],
+        critic: Mapping[str, Any],
     ) -> None:
         self.agent, self.desired_kl = agent, desired_kl
         own = dict(critic)
