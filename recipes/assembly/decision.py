@@ -1,4 +1,4 @@
-"""The decisions of a rollout: belief module, policy head, sample and log-probability in one call."""
+"""The decisions of a rollout: belief, policy head, sample and log-probability in one call."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
 from assembly.agent import Agent
+from torchrl_drbpn import BeliefFilterModule
+from torchrl_drbpn.functional import StateSpace
 
 _LOG_SQRT_2PI = math.log(math.sqrt(2 * math.pi))
 
@@ -44,21 +46,24 @@ class RolloutPolicy(TensorDictModuleBase):
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
-        self.belief, self.actor = agent.belief, agent.actor
+        belief = agent.belief
+        self.belief, self.actor = belief, agent.actor
         self.in_keys, self.out_keys = list(agent.policy.in_keys), list(agent.policy.out_keys)
         # In a plain dictionary: nn.Module's attributes cost a microsecond each.
         self.__dict__["_layers"] = list(agent.location)
         self.__dict__["_widen"] = agent.scale
-        self.__dict__["_spread"] = None
+        self.__dict__["_filter"] = belief if isinstance(belief, BeliefFilterModule) else None
+        self.refresh()
 
+    _filter: BeliefFilterModule | None
+    _model: StateSpace | None
     _layers: list[nn.Module]
     _widen: nn.Module
     _spread: _Spread | None
 
-    @torch.no_grad()
     def refresh(self) -> None:
-        """Forget what was computed from the parameters; to be called when they have changed."""
-        self.__dict__["_spread"] = None
+        """Forget what was computed from the parameters: to be called before every rollout."""
+        self.__dict__["_spread"] = self.__dict__["_model"] = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the belief, the action, its distribution and its log-probability.
@@ -69,10 +74,15 @@ class RolloutPolicy(TensorDictModuleBase):
         Returns:
             The same tensordict.
         """
-        tensordict = self.belief(tensordict)
         if torch.is_grad_enabled() or interaction_type() is not InteractionType.RANDOM:
-            decided: TensorDictBase = self.actor(tensordict)
+            decided: TensorDictBase = self.actor(self.belief(tensordict))
             return decided
+        if self._filter is None:
+            tensordict = self.belief(tensordict)
+        else:
+            if self._model is None:
+                self.__dict__["_model"] = self._filter.filter.state_space()
+            tensordict = self._filter.step(tensordict, self._model)
         loc: Tensor = tensordict._get_str("features", None)
         for layer in self._layers:
             if isinstance(layer, nn.Linear):

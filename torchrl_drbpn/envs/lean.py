@@ -15,8 +15,8 @@ class LeanTransformedEnv(TransformedEnv):
     """Step a transformed batch of simulators as ``TransformedEnv`` does, in less time.
 
     The same keys, values, order of calls and random numbers: only the Python around the transforms
-    is shorter in ``step_and_maybe_reset``, which collectors and ``rollout`` call. What is out of the
-    ordinary (another base environment than this package's batches, nested rewards or flags,
+    is shorter in ``step_and_maybe_reset``, which collectors and ``rollout`` call. What is out of
+    the ordinary (another base environment than this package's batches, nested rewards or flags,
     ``"_step"`` masks, hooks after the step, entries that are neither tensors nor TensorDicts)
     goes the way of ``TransformedEnv``.
 

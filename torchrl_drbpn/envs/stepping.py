@@ -176,9 +176,9 @@ class Plan:
         return merged
 
 
-# ------------------------------------------------------------------------------ TensorDicts as dicts
+# --------------------------------------------------------------------- TensorDicts as dictionaries
 # TensorDict's public operations check and copy at every call, which costs more than the arithmetic
-# of sixteen robots. TorchRL's own step uses the same three internals: _tensordict, _set_str, _new_unsafe.
+# of sixteen robots. TorchRL's own step uses the same internals: _set_str, _new_unsafe.
 def _new(source: dict[str, Any], like: TensorDictBase) -> TensorDict:
     return TensorDict._new_unsafe(source, batch_size=like.batch_size, device=like.device)
 
@@ -205,7 +205,7 @@ def _shallow(tensordict: TensorDict) -> TensorDict:
 def _fill(following: TensorDictBase, preset: TensorDict) -> None:
     """Enter what the policy wrote under ``"next"`` where the environment did not write it."""
     for key, value in preset._tensordict.items():
-        present = following.get(key, None)
+        present = following._get_str(key, None)
         if present is None:
             copy = value if isinstance(value, Tensor) else _shallow(value)
             following._set_str(key, copy, validated=True, inplace=False, non_blocking=False)
@@ -247,7 +247,6 @@ def _merge(root: TensorDict, fresh: TensorDict | None, keep: Tensor) -> None:
             _merge(old, new, keep)
             continue
         rows = _over(keep, column, old)
-        # where, not masked_fill, although it is slower: dtypes have to match.
         entries[key] = torch.where(rows, old, 0 if new is None else new)
     for key, new in others.items():
         if key not in entries:

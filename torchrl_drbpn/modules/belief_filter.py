@@ -185,6 +185,7 @@ class BeliefFilter(nn.Module):
         reset: Tensor,
         *,
         return_cov: bool = False,
+        model: StateSpace | None = None,
     ) -> FilterOutput:
         """Filter one step.
 
@@ -199,6 +200,8 @@ class BeliefFilter(nn.Module):
 
         Keyword Args:
             return_cov: whether the filtered covariance is wanted.
+            model: what :meth:`state_space` returned, for many steps with the same parameters; it
+                is built anew by default.
 
         Returns:
             :class:`~torchrl_drbpn.functional.FilterOutput`: mean, cov (None where not asked
@@ -210,7 +213,7 @@ class BeliefFilter(nn.Module):
         del cov
         self._check_shapes(mean, previous_action, observation, observed, reset)
         out = filter_step(
-            self.state_space(),
+            self.state_space() if model is None else model,
             mean,
             previous_action,
             observation,

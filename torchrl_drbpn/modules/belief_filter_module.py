@@ -15,7 +15,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
-from torchrl_drbpn.functional import tril_to_vector
+from torchrl_drbpn.functional import StateSpace, tril_to_vector
 from torchrl_drbpn.modules._keys import read_entry, read_in_keys, read_out_keys
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 
@@ -127,6 +127,37 @@ class BeliefFilterModule(TensorDictModuleBase):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the belief; see the class for keys and modes."""
+        return self._write(tensordict, self.recurrent_mode, None)
+
+    def step(self, tensordict: TensorDictBase, model: StateSpace | None = None) -> TensorDictBase:
+        """Write the belief of one step, whatever the mode.
+
+        Args:
+            tensordict: the entries read by :meth:`forward`.
+            model: what ``filter.state_space()`` returned: a rollout, whose parameters stay what
+                they are, builds it once instead of at every step.
+
+        Returns:
+            The tensordict.
+
+        Example:
+            >>> import torch
+            >>> from tensordict import TensorDict
+            >>> module = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
+            >>> data = TensorDict(
+            ...     observation=torch.randn(3, 5), observed=torch.rand(3, 5) < 0.7,
+            ...     previous_action=torch.zeros(3, 2), is_init=torch.ones(3, 1, dtype=torch.bool),
+            ...     recurrent=dict(mean=torch.zeros(3, 5), age=torch.zeros(3, 1).long()),
+            ...     batch_size=[3])
+            >>> once = module.step(data.copy(), module.filter.state_space())
+            >>> bool((once == module(data)).all())
+            True
+        """
+        return self._write(tensordict, False, model)
+
+    def _write(
+        self, tensordict: TensorDictBase, sequence: bool, model: StateSpace | None
+    ) -> TensorDictBase:
         observation, observed, action, is_init = (
             read_entry(tensordict, self.in_keys, i) for i in range(4)
         )
@@ -135,7 +166,6 @@ class BeliefFilterModule(TensorDictModuleBase):
         mean = tensordict.get(self.in_keys[4], None)
         age = tensordict.get(self.in_keys[5], None)
         first = is_init.squeeze(-1)
-        sequence = self.recurrent_mode
         if sequence and first.ndim == 0:
             raise ValueError(
                 "under set_recurrent_mode(True) the last batch dimension is time, but the input "
@@ -158,8 +188,9 @@ class BeliefFilterModule(TensorDictModuleBase):
                 age = _steps_since(reset)
         else:
             out = self.filter.step(
-                mean, None, action, observation, observed, reset, return_cov=want_cov
-            )
+                mean, None, action, observation, observed, reset,
+                return_cov=want_cov, model=model,
+            )  # fmt: skip
 
         tensordict.set(self._next_mean, out.mean)
         tensordict.set(self._next_age, age + 1)
