@@ -304,6 +304,34 @@ class RecipeBeliefContract(BeliefFrames):
         assert not {id(t) for t in first} & {id(t) for t in second}
         check_env_specs(self.make_env(belief))
 
+    def test_what_it_tells_of_the_sensors_comes_from_the_same_belief(self):
+        from assembly import beliefs
+
+        belief = self.make_belief()
+        if belief.observing is None:
+            return
+        step = self.one_by_one(belief.module, self.frames(2), None)[:, 1]
+        observing = belief.observing()
+        out = observing(step.select(*belief.module.in_keys))
+        for key in belief.module.out_keys:
+            torch.testing.assert_close(out[key], step[key])
+        weights = {id(parameter) for parameter in belief.module.parameters()}
+        assert {id(parameter) for parameter in observing.parameters()} <= weights
+        told = {beliefs.FORECAST_COV: (3, OBS, OBS)} | dict.fromkeys(
+            (
+                beliefs.ESTIMATE,
+                beliefs.ESTIMATE_VARIANCE,
+                beliefs.FORECAST,
+                beliefs.NOISE_VARIANCE,
+            ),
+            (3, OBS),
+        )
+        written = [key for key in told if out.get(key, None) is not None]
+        assert written
+        for key in written:
+            assert out[key].shape == told[key], key
+            assert out[key].isfinite().all(), key
+
     def test_its_summary_is_finite_numbers_by_name(self):
         summary = self.make_belief().summary()
         assert all(isinstance(name, str) for name in summary)
