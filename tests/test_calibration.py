@@ -9,6 +9,8 @@ deleted entries. A filter with a wrong covariance is told from a right one.
 from __future__ import annotations
 
 import math
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -30,6 +32,10 @@ from torchrl_drbpn.functional import (
     reliability_curve,
     update,
 )
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+
+import constant_covariance
 
 BATCH, TIME, STATE, OBS = 256, 40, 3, 4
 LEVELS = torch.tensor([0.5, 0.9, 0.95], dtype=torch.float64)
@@ -129,6 +135,29 @@ def test_the_consistency_test_passes_the_exact_filter_and_fails_wrong_covariance
 def test_the_log_score_is_best_for_the_right_covariance(exact: Filtered) -> None:
     scores = [log_score(exact.errors, c * exact.covs, exact.observed) for c in (0.7, 1.0, 1.4)]
     assert min(scores) == scores[1]
+
+
+def test_a_constant_covariance_is_too_sure_in_outages_which_its_average_nis_does_not_tell() -> None:
+    """The figures of docs/calibration.md, on fewer and shorter sequences."""
+    model = constant_covariance.system()
+    case = (0.5, 20.0, False)
+    _, observation, observed = constant_covariance.simulate(model, case, 60, 80, seed=0)
+    cov = constant_covariance.trained_cov(model, observation, observed, iterations=60)
+    data = constant_covariance.simulate(model, case, 60, 80, seed=1)
+    found = {
+        name: {
+            key: (sums[key].sum() / sums[per].sum()).item()
+            for key, per in (("nees", "entries"), ("nis", "dof"), ("se", "entries"))
+        }
+        for name, sums in (
+            ("constant", constant_covariance.judge(model, cov, *data)),
+            ("exact", constant_covariance.judge(model, None, *data)),
+        )
+    }
+    assert found["exact"]["nees"] == pytest.approx(1, abs=0.1)
+    assert found["constant"]["nees"] > 1.4
+    assert found["constant"]["se"] > 1.05 * found["exact"]["se"]
+    assert found["constant"]["nis"] == pytest.approx(1, abs=0.15)
 
 
 # Masks -------------------------------------------------------------------------------------------
