@@ -89,6 +89,10 @@ class Plan:
             following = self._reset_finished(following, finished)
         return root, following
 
+    def __reduce__(self) -> tuple[type[None], tuple[()]]:
+        """Leave nothing in a copy or a pickle: a copied environment makes a plan of its own."""
+        return type(None), ()
+
     def takes(self, tensordict: TensorDictBase) -> TypeGuard[TensorDict]:
         """Tell whether a root is of the ordinary kind.
 

@@ -1,0 +1,86 @@
+"""RolloutPolicy: what the agent's policy writes, to the last bit, from the same random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import ExplorationType, set_exploration_type
+
+pytest.importorskip("hydra")
+from recipe_tools import make_config  # isort: skip
+
+from assembly.decision import RolloutPolicy
+from assembly.settings import read_settings
+from assembly.training import Training, assemble
+
+SMALL = ("env=inverted_pendulum", "experiment=smoke")
+
+
+def make(belief: str) -> tuple[Training, RolloutPolicy, TensorDictBase]:
+    training = assemble(read_settings(make_config(*SMALL, f"belief={belief}")))
+    return training, RolloutPolicy(training.agent), training.env.reset()
+
+
+@torch.no_grad()
+def decide(
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    root: TensorDictBase,
+    mode: ExplorationType = ExplorationType.RANDOM,
+) -> TensorDictBase:
+    torch.manual_seed(0)
+    with set_exploration_type(mode):
+        return policy(root.copy())
+
+
+def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    for key, value in first.items(True, True):
+        assert torch.equal(value, second[key]), key
+
+
+@pytest.mark.parametrize("belief", ["drbpn", "gru", "none"])
+@pytest.mark.parametrize("mode", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+def test_it_decides_as_the_agent_does(belief: str, mode: ExplorationType) -> None:
+    training, policy, root = make(belief)
+    for _ in range(3):
+        expected = decide(training.agent.policy, root, mode)
+        assert_same(expected, decide(policy, root, mode))
+        _, root = training.env.step_and_maybe_reset(expected)
+
+
+def test_a_refresh_takes_the_new_parameters() -> None:
+    training, policy, root = make("drbpn")
+    decide(policy, root)
+    with torch.no_grad():
+        for parameter in training.agent.parameters():
+            parameter.add_(0.1)
+    policy.refresh()
+    assert_same(decide(training.agent.policy, root), decide(policy, root))
+
+
+def test_every_rollout_of_the_collector_begins_with_a_refresh() -> None:
+    training, _, _ = make("drbpn")
+    training.collector.rollout()
+    with torch.no_grad():
+        training.agent.scale.state_independent_scale.fill_(-2.0)
+    scale = training.collector.rollout()["scale"]
+    assert torch.allclose(scale, torch.tensor(-2.0).exp())
+
+
+def test_a_policy_that_diverged_raises_as_the_actor_does() -> None:
+    training, policy, root = make("none")
+    with torch.no_grad():
+        training.agent.location[0].weight.fill_(torch.nan)
+    with pytest.raises(Exception, match="loc"):
+        decide(training.agent.policy, root)
+    with pytest.raises(Exception, match="loc"):
+        decide(policy, root)
+
+
+def test_gradients_come_from_the_actor() -> None:
+    _, policy, root = make("drbpn")
+    out = policy(root.copy())
+    assert out["action_log_prob"].requires_grad
