@@ -83,3 +83,11 @@ def test_the_first_epoch_is_that_of_the_plain_update_and_later_ones_differ():
     assert losses(True, 1) == losses(False, 1)
     assert losses(True, 3) == losses(True, 3)
     assert losses(True, 3) != losses(False, 3)
+
+
+def test_a_belief_without_memory_learns_from_single_steps():
+    lengths = {}
+    for belief in ("none", "fill", "gru", "drbpn"):
+        training, data = collected(f"belief={belief}", "optim.sequence_length=8")
+        lengths[belief] = training.algorithm.sequences(data, 0).shape[1]
+    assert lengths == {"none": 1, "fill": 1, "gru": 8, "drbpn": 8}

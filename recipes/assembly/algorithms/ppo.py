@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.modules.utils import get_primers_from_module
 
 from assembly.agent import Agent
 from assembly.rollout import make_gae, minibatches, recompute_advantages, to_sequences
@@ -26,6 +27,7 @@ class PPO:
     Attributes:
         loss: its outputs named ``loss*`` are summed.
         gae: estimator of advantages, where they are recomputed.
+        sequence_length: time steps of a sequence; 1 where the belief has no memory.
         optimizer: Adam over all parameters of the agent.
         generator: of the order of minibatches.
     """
@@ -34,6 +36,10 @@ class PPO:
         self.agent, self.optim = agent, settings.optim
         self.loss = agent.make_loss(settings.loss)
         self.gae = make_gae(settings.loss)
+        # Without memory no gradient flows through time: steps drawn one by one depend less on each
+        # other than sequences do, and train better for nothing (docs/reproduction.md).
+        recurrent = get_primers_from_module(agent.belief, warn=False) is not None
+        self.sequence_length = settings.optim.sequence_length if recurrent else 1
         self.optimizer = torch.optim.Adam(
             agent.parameters(), lr=settings.optim.lr, eps=settings.optim.eps, fused=True
         )
@@ -65,7 +71,7 @@ class PPO:
         """
         if epoch and self.optim.recompute_advantages:
             recompute_advantages(data, self.agent, self.gae)
-        return to_sequences(data, self.loss, self.optim.sequence_length)
+        return to_sequences(data, self.loss, self.sequence_length)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the optimiser's state and the generator's.
