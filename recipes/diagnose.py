@@ -30,7 +30,7 @@ from assembly.points import read_point
 from assembly.report_page import csv_cells
 from assembly.report_runs import find_folders
 from assembly.run_folder import write_table
-from assembly.settings import MissingnessSettings, check_mode
+from assembly.settings import MissingnessSettings, check_mode, missingness_name
 from assembly.trained import TrainedAgent, load_trained_agent
 from omegaconf import DictConfig, OmegaConf
 
@@ -123,7 +123,7 @@ def _diagnoses(
 
 def _summary(folder: Path, point: MissingnessSettings, tally: Tally) -> str:
     """Return a line: the error of each estimate where sensors are missing, NIS over entries."""
-    parts = [f"{folder.name}, {_text(point)}, missing {tally.missing_ratio:.3f}"]
+    parts = [f"{folder.name}, {missingness_name(point)}, missing {tally.missing_ratio:.3f}"]
     for row in precision_rows(tally, resamples=2, seed=0):
         if row["entries"] == "missing" and row["steps_since_seen"] == "all":
             parts.append(f"{row['estimate']} {row['rmse']:.3f}")
@@ -143,17 +143,12 @@ def _common(
         "task": settings.env.env_id,
         "belief": str(settings.belief.get("name", "")),
         "training_seed": settings.seed,
-        "trained_on": _text(settings.missingness),
-        "point": _text(point),
+        "trained_on": missingness_name(settings.missingness),
+        "point": missingness_name(point),
         "missing_ratio": tally.missing_ratio,
         "mode": mode,
         "episodes": len(tally.lengths),
     }
-
-
-def _text(missingness: MissingnessSettings) -> str:
-    """Return a point as it is written on the command line."""
-    return f"{missingness.mechanism}:{missingness.eta:g}"
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="diagnose")
