@@ -184,7 +184,8 @@ def _grid(
                 runs = sum(s.runs for s in own)
                 axis.set_title(
                     f"{task}, {point}, {100 * missing:.0f} % missing, "
-                    f"{runs} run{'s' if runs > 1 else ''}"
+                    f"{runs} run{'s' if runs > 1 else ''}",
+                    fontsize=8.5,
                 )
                 if axis.get_yscale() == "log":
                     axis.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
