@@ -85,11 +85,15 @@ def evaluation_command(run: StudyRun) -> str | None:
     present = {row["mode"] for row in rows}
     modes = [mode for mode in ("sampled", "mean") if mode in present]
     episodes = max(int(row["episodes"]) for row in rows)
-    folder = f"runs/{run.study}/*" if run.study else f"runs/{run.name}"
-    words = [f"run={folder}", f"points=[{','.join(points)}]", f"episodes={episodes}"]
+    words = [f"points=[{','.join(points)}]", f"episodes={episodes}"]
     if len(modes) < 2:
         words.append(f"modes=[{','.join(modes)}]")
-    return " ".join(["python recipes/evaluate.py", *(shlex.quote(word) for word in words)])
+    options = " ".join(shlex.quote(word) for word in words)
+    if run.study is None:
+        return f"python recipes/evaluate.py {shlex.quote(f'run=runs/{run.name}')} {options}"
+    # One table in each run folder; of several runs at once evaluate.py makes one beside them.
+    folders = f"$(dirname runs/{run.study}/*/config.yaml)"
+    return f"for run in {folders}; do python recipes/evaluate.py run=$run {options}; done"
 
 
 def commands_from_nothing(

@@ -281,10 +281,13 @@ def _evaluations(folder: Path, settings: Settings) -> list[Row]:
             {"source": row["kind"], "point": missingness_name(settings.missingness)}
             | {key: row.get(key) for key in _EVALUATED}
         )
-    path = folder / "points.csv"
-    if path.is_file():
-        rows += _points(_read_csv(path, {"frames", "mechanism", "eta", "mode", "return", "length"}))
-    return rows
+    # Of points that were asked for, and of the grid; a point of both has the same episodes twice.
+    episodes: list[Row] = []
+    for path in (folder / "points.csv", folder / "robustness.csv"):
+        if path.is_file():
+            needed = {"frames", "mechanism", "eta", "mode", "return", "length"}
+            episodes += _read_csv(path, needed)
+    return rows + _points(episodes)
 
 
 _EVALUATED = (
