@@ -87,11 +87,11 @@ def configured(*overrides: str) -> dict[str, Any]:
     return {str(key): value for key, value in composed.items()}
 
 
-def evaluate(output: Path, *runs: Path, points: str = "", **options: Any) -> list[dict[str, str]]:
+def evaluate(table: Path, *runs: Path, points: str = "", **options: Any) -> list[dict[str, str]]:
     base = configured(*([f"points=[{points}]"] if points else []))
-    base |= {"run": [str(r) for r in runs], "output": str(output), "processes": 1, "episodes": 2}
+    base |= {"run": [str(r) for r in runs], "output": str(table), "processes": 1, "episodes": 2}
     assert recipe.run(base | {"figures": False} | options) == 0
-    with output.open(newline="") as file:
+    with table.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -171,13 +171,12 @@ def test_random_reduction_is_the_same_for_every_agent_and_nested(
     agent: TrainedAgent, feedforward: Path
 ) -> None:
     other = load_trained_agent(feedforward)
-    chosen = [
-        [
-            removed_sensors(parse(f"reduction:{ratio}:random", a.settings), a, 0)
-            for a in (agent, other)
-        ]
-        for ratio in (0.25, 0.5, 1.0)
-    ]
+
+    def chosen_for(ratio: float) -> list[list[int]]:
+        point = parse(f"reduction:{ratio}:random", agent.settings)
+        return [removed_sensors(point, any_agent, 0) for any_agent in (agent, other)]
+
+    chosen = [chosen_for(ratio) for ratio in (0.25, 0.5, 1.0)]
     assert all(first == second for first, second in chosen)
     assert [len(first) for first, _ in chosen] == [1, 2, 4]
     assert set(chosen[0][0]) < set(chosen[1][0]) < set(chosen[2][0])
@@ -229,7 +228,7 @@ def test_one_row_an_episode_and_a_baseline_only_at_random(
     assert {row["seed"] for row in rows} == {"10000"}
     mcar = [row for row in rows if row["point"] == "mcar:0.5"]
     assert {row["eta"] for row in mcar} == {"0.5"}
-    assert all(0.2 < float(row["missing_ratio"]) < 0.8 for row in mcar)
+    assert 0.3 < np.mean([float(row["missing_ratio"]) for row in mcar]) < 0.7
 
 
 def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(
@@ -356,12 +355,13 @@ def test_groups_need_names() -> None:
 def test_the_interval_of_a_mean_covers_it_95_times_in_100() -> None:
     generator = np.random.default_rng(0)
     hits = 0
-    for trial in range(300):
+    for trial in range(1000):
         mean, low, high = mean_interval([generator.normal(3.0, 2.0, 30).tolist()], seed=trial)
         assert low < mean < high
         hits += low < 3.0 < high
-    # the percentile bootstrap of 30 values covers a little less than it says
-    assert 0.90 < hits / 300 < 0.98
+    # The percentile bootstrap of n values is as wide as 1.96 sqrt((n - 1) / n) standard errors, and
+    # Student's t of 29 degrees exceeds 1.93 in 6.4 % of all cases.
+    assert abs(hits / 1000 - 0.936) < 3 * (0.936 * 0.064 / 1000) ** 0.5
 
 
 def test_the_interval_sees_the_spread_between_runs() -> None:
