@@ -96,7 +96,7 @@ CHAINS: dict[str, Callable[[], list[Transform]]] = {
         PreviousAction(),
     ],
     "a primer that is not zero": lambda: [
-        TensorDictPrimer(memory=Unbounded((2,)), default_value=3.0, expand_specs=True)
+        TensorDictPrimer(start=Unbounded((2,)), default_value=3.0, expand_specs=True)
     ],
     "a hook": lambda: [StepCounter(), Marks()],
 }
