@@ -70,16 +70,6 @@ def test_every_rollout_of_the_collector_begins_with_a_refresh() -> None:
     assert torch.allclose(scale, torch.tensor(-2.0).exp())
 
 
-def test_a_policy_that_diverged_raises_as_the_actor_does() -> None:
-    training, policy, root = make("none")
-    with torch.no_grad():
-        training.agent.location[0].weight.fill_(torch.nan)
-    with pytest.raises(Exception, match="loc"):
-        decide(training.agent.policy, root)
-    with pytest.raises(Exception, match="loc"):
-        decide(policy, root)
-
-
 def test_gradients_come_from_the_actor() -> None:
     _, policy, root = make("drbpn")
     out = policy(root.copy())

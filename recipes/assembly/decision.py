@@ -37,8 +37,7 @@ class RolloutPolicy(TensorDictModuleBase):
 
     A ``ProbabilisticActor`` builds a distribution, checks its parameters and looks up keys at
     every step, which costs several times what the networks do for sixteen robots. It still decides
-    where actions are not sampled (``set_exploration_type``), where gradients are wanted, and where
-    a log-probability is not finite, so that its own error says why.
+    where actions are not sampled (``set_exploration_type``) and where gradients are wanted.
 
     Args:
         agent: whose modules decide.
@@ -97,8 +96,6 @@ class RolloutPolicy(TensorDictModuleBase):
         action = torch.empty_like(loc).normal_().mul_(spread.scale).add_(loc)
         log_prob = (action - loc).square_().neg_().div_(spread.twice_variance)
         log_prob = log_prob.sub_(spread.log_scale).sub_(_LOG_SQRT_2PI).sum(-1)
-        if not math.isfinite(log_prob.sum().item()):
-            return self.actor(tensordict)
         for key, value in (
             ("loc", loc),
             ("scale", spread.scale),
