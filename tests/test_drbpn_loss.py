@@ -27,7 +27,6 @@ from contracts import LossContract
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
-from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss
@@ -119,12 +118,12 @@ def test_one_pass_over_time_and_one_step_for_the_last_observations():
     agent = make_belief_agent()
     loss, data = make_loss(agent), make_data()
     calls = []
-    agent.belief.register_forward_hook(
-        lambda module, args, out: calls.append((recurrent_mode(), tuple(out.shape)))
+    agent.belief.filter.register_forward_hook(
+        lambda module, args, out: calls.append(tuple(out.log_likelihood.shape))
     )
     loss(data)
     ends = (data["next", "done"] | data["final"]).sum().item()
-    assert calls == [(True, tuple(data.shape)), (False, (ends,))]
+    assert calls == [tuple(data.shape), (ends, 1)]
 
 
 def test_what_the_collector_wrote_of_the_belief_is_not_read():

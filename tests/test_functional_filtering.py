@@ -2,9 +2,9 @@
 
 Specified here, in float64 unless the test is about float32:
 
-- each form (innovation, native, information, loop) equals the row-deleting oracle to 1e-10, in values and
-  in the gradient by every input and parameter, for state smaller than, equal to and larger than
-  obs, with resets, restarts, frames that hold nothing, and diagonal or full noise;
+- each form (innovation, native, information, loop) equals the row-deleting oracle to 1e-10, in
+  values and in the gradient by every input and parameter, for state smaller than, equal to and
+  larger than obs, with resets, restarts, frames that hold nothing, and diagonal or full noise;
 - the forms equal each other; a sequence equals its steps; a reset inside a sequence equals two
   sequences; a restart equals a sequence begun from the stored belief; batch shape is immaterial;
 - nothing observed: the means are the bare transition and the log-likelihood 0, exactly;

@@ -28,6 +28,7 @@ from assembly.training import (
     training_state,
 )
 from torchrl_drbpn import BeliefDivergedError
+from torchrl_drbpn.functional import native_error
 
 EVALUATION_COLUMNS = (
     "frames",
@@ -70,6 +71,9 @@ def run(config: Mapping[str, Any], folder: Path) -> int:
                 f"env.backend={settings.env.backend} can't save the state of "
                 f"{settings.env.env_id}: going on with new episodes"
             )
+    slower = native_error() if settings.belief["name"] == "drbpn" else None
+    if slower is not None:
+        say(f"the belief filter runs in PyTorch, which is slower than in C: {slower}")
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder, {**config, "resume": None})
     write_versions(folder)

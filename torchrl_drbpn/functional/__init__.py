@@ -42,6 +42,7 @@ from torchrl_drbpn.functional.gaussian import (
 )
 from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
 from torchrl_drbpn.functional.model import StateSpace, choose_form, predict_step
+from torchrl_drbpn.functional.native import native_error
 from torchrl_drbpn.functional.particles import (
     DiagonalGaussian,
     Outcome,
@@ -98,6 +99,7 @@ __all__ = [
     "masked_cov",
     "masked_log_density",
     "missing_probability",
+    "native_error",
     "normalised_squared",
     "outage_rates",
     "particle_sequence",

@@ -106,9 +106,21 @@ def filter_step(
         (True, True)
     """
     check_observed(observation, observed)
+    chosen = checked_form(model, form)
+    if (
+        chosen == "innovation"
+        and form == "auto"
+        and not torch.is_grad_enabled()  # with a gradient, one that can be differentiated again
+        and native_refusal(model, mean, previous_action, observation) is None
+    ):
+        x, seen = observation.unsqueeze(reset.ndim), observed.unsqueeze(reset.ndim)
+        action, start = previous_action.unsqueeze(reset.ndim), reset.unsqueeze(-1)
+        m, ll = _native(model, mean, action, x, seen, start, None, None)
+        cov = filtered_cov(model, observed, reset) if return_cov else None
+        return FilterOutput(m.squeeze(-2), cov, ll.squeeze(-1))
     predicted = predict_step(model, mean, previous_action, reset)
     H, offset = model.emission_matrix, model.offset(previous_action)
-    if checked_form(model, form) == "loop":
+    if chosen == "loop":
         R = model.full_emission_cov()
         filtered = update(predicted, observation, observed, H, R, offset)
         ll = log_likelihood(predicted, observation, observed, H, R, offset)
@@ -118,7 +130,7 @@ def filter_step(
     m = predicted.mean
     residual = zero_missing(zero_missing(observation, observed) - (offset + m @ H.mT), observed)
     row = reset.unsqueeze(-1)
-    if checked_form(model, form) == "information":
+    if chosen == "information":
         # In float64, as in the sequence: the two must agree to the rounding of their own dtype.
         wide = model.double()
         residual = residual.double()

@@ -31,6 +31,7 @@ from torchrl_drbpn.functional.recurrence import MeanNetwork
 __all__ = ["NativeRecurrence", "native_error", "native_refusal"]
 
 _SOURCE = Path(__file__).with_name("native.c")
+_CPU = torch.device("cpu")
 _REALS = {torch.float32: "float", torch.float64: "double"}
 # Vectors of the width that PyTorch found: the compiled file then runs wherever its name is equal.
 _MACHINE_FLAGS = {"AVX512": ["-march=x86-64-v4"], "AVX2": ["-march=x86-64-v3"]}
@@ -128,9 +129,11 @@ def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
     given = [x for x in every if isinstance(x, Tensor)]
     if torch.compiler.is_compiling():
         return "torch.compile traces PyTorch's operations"
-    if any(x.device.type != "cpu" for x in given):
+    if torch._C._are_functorch_transforms_active():
+        return "torch.func transforms PyTorch's operations"
+    if {x.device for x in given} != {_CPU}:
         return "it runs on the CPU"
-    if any(x.dtype != dtype for x in given):
+    if {x.dtype for x in given} != {dtype}:
         return "the dtypes differ"
     if obs > _MAX_OBS:
         return f"obs is {obs}, more than {_MAX_OBS}"

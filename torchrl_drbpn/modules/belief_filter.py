@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -136,6 +137,7 @@ class BeliefFilter(nn.Module):
         self.emission = emission
         self.initial_mean = nn.Parameter(torch.zeros(state_dim, device=device, dtype=dtype))
         self.initial_noise = initial_covariance(state_dim, initial_cov, initial_std, device, dtype)
+        self._shared: StateSpace | None = None
         checked_form(self.state_space(), form)
 
     def reset_parameters(self) -> None:
@@ -154,6 +156,30 @@ class BeliefFilter(nn.Module):
 
     def state_space(self) -> StateSpace:
         """Return the model's tensors, built from the parameters (differentiable)."""
+        return self._state_space() if self._shared is None else self._shared
+
+    @contextmanager
+    def shared_state_space(self) -> Iterator[StateSpace]:
+        """Build the model's tensors once for all calls inside the block.
+
+        For a loss that calls the filter several times: the parameters must not change inside.
+
+        Yields:
+            What :meth:`state_space` returns until the block ends.
+
+        Example:
+            >>> filter = BeliefFilter(obs_dim=5, action_dim=2)
+            >>> with filter.shared_state_space() as model:
+            ...     filter.state_space() is model
+            True
+        """
+        before, self._shared = self._shared, self.state_space()
+        try:
+            yield self._shared
+        finally:
+            self._shared = before
+
+    def _state_space(self) -> StateSpace:
         transition = self.transition
         mean: MeanNetwork | Callable[[Tensor, Tensor], Tensor]
         cov: Tensor | Callable[[Tensor, Tensor], Tensor]

@@ -10,10 +10,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import ValueEstimators
 
+from torchrl_drbpn.modules import BeliefFilter, BeliefFilterModule
 from torchrl_drbpn.objectives._clipped import plain_terms
 from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, last_steps
 
@@ -217,9 +219,16 @@ class DRBPNLoss(LossModule):
             if params is None
             else params.to_module(self.filter_network, preserve_module_state=False)
         ):
-            self.filter_network(data)
-            if self.model_loss is not None:
-                self._add_last_observations(data)
+            belief = getattr(self.filter_network, "filter", None)
+            # One set of Q, R, H, ... and one gradient of it for both passes.
+            with (
+                belief.shared_state_space()
+                if isinstance(belief, BeliefFilter) and self.model_loss is not None
+                else nullcontext()
+            ):
+                self.filter_network(data)
+                if self.model_loss is not None:
+                    self._add_last_observations(data)
 
         model = None if self.model_loss is None else self.model_loss(data)
         if self.detach_belief:
@@ -246,22 +255,39 @@ class DRBPNLoss(LossModule):
         )
         if not where[0].numel():
             return  # no row ends here; not every belief module takes an empty batch
-        # As sequences of one step, which have the fast forms.
-        gathered = TensorDict({}, batch_size=[len(where[0]), 1])
-        for key in self.filter_network.in_keys:
-            following = data.get(("next", key), None)
-            if following is not None and key != keys.is_init:
-                gathered.set(key, following[where].unsqueeze(1))
-        # A belief that goes on is what is wanted here.
-        start = torch.zeros(*gathered.shape, 1, dtype=torch.bool, device=log_likelihood.device)
-        gathered.set(keys.is_init, start)
-        self.filter_network(gathered)
+        following = [data.get(("next", key), None) for key in self.filter_network.in_keys]
+        next_ll = self._next_log_likelihood([None if x is None else x[where] for x in following])
         data.set(
-            keys.next_log_likelihood,
-            torch.zeros_like(log_likelihood).index_put(
-                where, gathered.get(keys.log_likelihood).squeeze(1)
-            ),
+            keys.next_log_likelihood, torch.zeros_like(log_likelihood).index_put(where, next_ll)
         )
+
+    def _next_log_likelihood(self, following: list[Tensor | None]) -> Tensor:
+        """Run the belief module on gathered steps, as sequences of one: they have the fast forms.
+
+        Args:
+            following: the entries that the belief module reads, ``(steps, ...)``.
+
+        Returns:
+            Shape ``(steps,)``.
+        """
+        module = self.filter_network
+        of_key = {
+            key: value.unsqueeze(1)
+            for key, value in zip(module.in_keys, following, strict=True)
+            if value is not None
+        }
+        count = len(next(iter(of_key.values())))
+        # A belief that goes on is what is wanted here.
+        goes_on = torch.zeros(count, 1, dtype=torch.bool, device=self.model_coeff.device)
+        if type(module) is BeliefFilterModule and len(of_key) == len(module.in_keys):
+            observation, observed, action, _, mean, _ = (of_key[key] for key in module.in_keys)
+            action = action.to(mean.dtype)
+            out = module.filter(mean[:, 0], None, action, observation, observed, goes_on)
+            return out.log_likelihood.squeeze(1)
+        gathered = TensorDict(of_key, batch_size=[count, 1])
+        gathered.set(self.tensor_keys.is_init, goes_on.unsqueeze(-1))
+        module(gathered)
+        return gathered.get(self.tensor_keys.log_likelihood).squeeze(1)
 
 
 def _inside_next(key: NestedKey | None) -> NestedKey | None:

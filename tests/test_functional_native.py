@@ -1,0 +1,115 @@
+"""The filter in C, where it differs from the other forms: machine, sizes, fallback.
+
+Its values and gradients are held to the row-deleting oracle beside the other forms in
+test_functional_filtering.py. Specified here:
+
+- batches that fill no, one or several groups of the vectorised factorisation, and one sensor as
+  well as the most, give the numbers of the PyTorch form, with gradients;
+- one covariance that cannot be factorised spoils its own row, no other;
+- a step without a gradient runs it too; under torch.func and with a gradient PyTorch runs;
+- without a compiler, with one that fails, or switched off: "auto" runs PyTorch and "native" says
+  why it cannot; a library that was compiled once is not compiled again.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from filter_problems import Problem, assert_equal, assert_same
+
+from torchrl_drbpn.functional import filter_sequence, filter_step, native
+
+pytestmark = pytest.mark.skipif(
+    native.native_error() is not None, reason="there is no C compiler on this machine"
+)
+
+
+@pytest.fixture
+def forgetful(monkeypatch, tmp_path):
+    """No library loaded yet, and an empty cache folder."""
+    for cached in (native._library, native.native_error):
+        cached.cache_clear()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    yield tmp_path
+    for cached in (native._library, native.native_error):
+        cached.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("batch", "time", "state", "obs"),
+    [(1, 1, 2, 1), (4, 6, 3, 3), (9, 3, 17, 17), (3, 11, 20, 17), (33, 2, 5, 4), (2, 2, 64, 64)],
+)
+def test_every_size_equals_the_pytorch_form(batch, time, state, obs):
+    problem = Problem(state, obs, batch=batch, time=time, hidden=(8, 5), activation="relu")
+    assert_same(problem, problem.fast("native"), problem.fast("innovation"), 1e-9)
+
+
+def test_a_covariance_that_cannot_be_factorised_spoils_its_own_row_alone():
+    problem = Problem(3, 3, batch=5, resets=False)
+    bad = problem.model()._replace(emission_cov=-torch.ones(3, dtype=torch.float64))
+    start, action, x, _, reset = problem.arguments()
+    nothing = torch.zeros_like(problem.observed)
+    seen = nothing.clone()
+    seen[2, 3] = True  # the only observation that arrives
+    out = filter_sequence(bad, start, action, x, seen, reset, form="native")
+    expected = filter_sequence(bad, start, action, x, nothing, reset, form="native")
+    assert out.log_likelihood[2, 3].isnan()
+    rows = [0, 1, 3, 4]
+    assert torch.equal(out.mean[rows], expected.mean[rows])
+    assert torch.equal(out.mean[2, :3], expected.mean[2, :3])
+
+
+def test_a_step_is_a_sequence_of_one_and_differentiable_as_often_as_wanted():
+    problem = Problem(4, 4, batch=6, time=1)
+    model, (start, action, x, seen, reset) = problem.model(), problem.arguments()
+    arguments = (start, action[:, 0], x[:, 0], seen[:, 0], reset[:, 0])
+    slow = filter_step(model, *arguments)
+    with torch.no_grad():
+        fast = filter_step(model, *arguments)
+        mapped = torch.func.vmap(lambda *a: filter_step(model, *a).mean)(*arguments)
+    for value in (fast.mean, mapped):
+        assert_equal(value, slow.mean.detach())
+    assert_equal(fast.log_likelihood, slow.log_likelihood.detach())
+    (once,) = torch.autograd.grad(slow.log_likelihood.sum(), start, create_graph=True)
+    assert torch.autograd.grad(once.square().sum(), start)[0].any()
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "reason"),
+    [
+        ("CC", "/nowhere/cc", "there is no C compiler"),
+        ("CC", "false", "`false` refused native.c"),
+        ("TORCHRL_DRBPN_NATIVE", "0", "switches it off"),
+    ],
+)
+def test_without_a_library_auto_runs_pytorch_and_native_says_why(
+    forgetful, monkeypatch, variable, value, reason
+):
+    monkeypatch.setenv(variable, value)
+    problem = Problem(4, 4)
+    for a, b in zip(problem.fast("auto"), problem.fast("innovation"), strict=True):
+        assert torch.equal(a, b)
+    with pytest.raises(ValueError, match=f"`form` 'native' cannot run here: .*{reason}"):
+        problem.fast("native")
+    assert not list(forgetful.rglob("*.so"))
+
+
+def test_a_library_is_compiled_once(forgetful):
+    assert native.native_error(torch.float64) is None
+    (library,) = forgetful.rglob("*.so")
+    written = library.stat().st_mtime_ns
+    for cached in (native._library, native.native_error):
+        cached.cache_clear()
+    assert native.native_error(torch.float64) is None
+    assert [p for p in forgetful.rglob("*") if p.is_file()] == [library]
+    assert library.stat().st_mtime_ns == written
+
+
+def test_what_it_does_not_take_it_names():
+    problem = Problem(3, 3)
+    model = problem.model()
+    assert native.native_refusal(model, torch.zeros(2)) == "the dtypes differ"
+    meta = torch.zeros(2, dtype=torch.float64, device="meta")
+    assert native.native_refusal(model, meta) == "it runs on the CPU"
+    wide = Problem(2, 65).model()
+    assert native.native_refusal(wide) == "obs is 65, more than 64"
