@@ -465,21 +465,12 @@ def _information(
     stored: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     f, drive, weights = _network(model, action)
-    y = zero_missing(observation - model.offset(action), observed).double()
-    # Everything ahead of the loop in float64 (see InformationRecurrence).
-    initial_mean = model.initial_mean
-    model = model.double()
-    H = model.emission_matrix
-    weight = observed / model.emission_cov
-    gathered = _gathered(model, weight)
-    prior, log_det_prior = _prior_precision(model)
-    precision = gathered + torch.where(reset.unsqueeze(-1), prior[1], prior[0])
-    m, mean, log_det = InformationRecurrence.apply(  # type: ignore[no-untyped-call]
-        f.residual, f.activation, precision, gathered, (weight * y) @ H, reset, restart, stored,
-        start, drive, initial_mean, *weights,
+    y = zero_missing(observation - model.offset(action), observed)
+    wide = model.double()  # see InformationRecurrence
+    prior, log_det = _prior_precision(wide)
+    mean, ll = InformationRecurrence.apply(  # type: ignore[no-untyped-call]
+        f.residual, f.activation, y, observed, wide.emission_matrix, wide.emission_cov, prior[0],
+        prior[1], reset, restart, stored, start, drive, model.initial_mean, *weights,
     )  # fmt: skip
-    m, step = m.double(), mean.double() - m.double()
-    residual = zero_missing(y - m @ H.mT, observed)
-    log_det = log_det + torch.where(reset.squeeze(-1), log_det_prior[1], log_det_prior[0])
-    ll = _information_likelihood(model, step, residual, weight, observed, log_det, reset)
+    ll = ll - 0.5 * torch.where(reset.squeeze(-1), log_det[1], log_det[0])
     return mean, ll.to(mean.dtype)

@@ -18,6 +18,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torchrl_drbpn.functional.gaussian import LOG_2PI
+
 __all__ = ["ACTIVATIONS", "InformationRecurrence", "InnovationRecurrence", "MeanNetwork"]
 
 ACTIVATIONS = ("relu", "tanh")
@@ -258,9 +260,7 @@ def _spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
     diagonal = factor.diagonal(dim1=-2, dim2=-1)
     diagonal.masked_fill_(failed, 1.0)
     inverse = torch.cholesky_inverse(factor).mT  # symmetric; LAPACK's result is column-major
-    inverse = (
-        inverse + torch.zeros_like(diagonal[..., :1]).masked_fill_(failed, torch.nan)[..., None]
-    )
+    inverse += torch.zeros_like(diagonal[..., :1]).masked_fill_(failed, torch.nan)[..., None]
     log_det = 2.0 * diagonal.log().sum(-1)
     return inverse, log_det
 
@@ -364,58 +364,114 @@ class InnovationRecurrence(torch.autograd.Function):
 
 
 class InformationRecurrence(torch.autograd.Function):
-    """mean_t = m_t + C_t (b_t - N_t m_t) with C_t = precision_t^-1, state x state factorised."""
+    """mean_t = C_t (H'W_t y_t + L_t m_t), C_t = (L_t + H'W_t H)^-1, and its log-likelihood.
+
+    W_t = diag(observed / R), L_t the inverse of the predicted covariance: state x state
+    factorised. What is inverted stays in float64: in float32 with R at its floor it would lose most
+    digits. The loop needs D_t = C_t H'W_t H = I - C_t L_t and c_t = C_t H'W_t y_t alone, which are
+    well scaled and go back to its dtype.
+
+    The filtered mean maximises the likelihood's quadratic form, so that form's gradient reaches the
+    predicted mean only, as L_t (mean_t - m_t), and no gradient of a factorisation is taken.
+    """
 
     @staticmethod
-    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor]:
-        """Return predicted mean, filtered mean and log|precision|."""
-        (residual, activation, precision, gathered, evidence) = args[:5]
-        reset, restart, restart_mean, start, drive, initial_mean, first, *rest = args[5:]
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor]:
+        """Return filtered mean and log-likelihood (float64, without log|predicted covariance|)."""
+        (residual, activation, y, observed, H, noise, prior, initial_prior) = args[:8]
+        reset, restart, restart_mean, start, drive, initial_mean, first, *rest = args[8:]
         steps = _Steps(residual, activation, first, tuple(rest))
+        time, batch = y.shape[:2]
+        state = start.shape[-1]
+
+        mask = observed.to(H.dtype)
+        weight = (mask / noise).flatten(0, 1)
+        y = y.to(H.dtype).flatten(0, 1)
+        # Weights of exactly 0 or 1 choose exactly.
+        at_reset = reset.to(H.dtype).reshape(-1, 1, 1)
+        before = torch.lerp(prior, initial_prior, at_reset)  # L
+        # Only the lower triangle of H'WH is computed; the factorisation reads no other entry.
+        row, column = torch.tril_indices(state, state, device=H.device)
+        products = (H.unsqueeze(-1) * H.unsqueeze(-2))[:, row, column]
+        place = torch.zeros(state, state, dtype=torch.int64, device=H.device)
+        place[row, column] = torch.arange(len(row), device=H.device)
+        precision = (weight @ products).index_select(1, place.flatten()).view(-1, state, state)
+        precision += before
         C, log_det = _spd_inverse(precision)
-        # precision, gathered and evidence come in float64: inverted in float32 with R at its floor
-        # they lose most digits. What the loop needs is well scaled and goes back to its dtype.
-        D = (C @ gathered).to(start.dtype)
-        c = (C @ evidence.unsqueeze(-1)).squeeze(-1).to(start.dtype)
+        D = C @ before
+        D.neg_().diagonal(dim1=-2, dim2=-1).add_(1.0)
+        # Nothing observed: D is 0, which the difference gives to rounding only.
+        D *= observed.any(-1).view(-1, 1, 1)
+        c = (C @ ((weight * y) @ H).unsqueeze(-1)).squeeze(-1)
+        shape = (time, batch, state)
+        D, c = D.to(start.dtype).view(*shape, state), c.to(start.dtype).view(shape)
         predicted, filtered, inputs, hidden = _run(
             steps, drive, start, reset, initial_mean, restart, restart_mean, D, c, None
         )
         m, mean = torch.stack(predicted), torch.stack(filtered)
+
+        wide = mean.flatten(0, 1).to(H.dtype)
+        delta = wide - m.flatten(0, 1).to(H.dtype)
+        left = torch.addmm(y, wide, H.t(), alpha=-1)  # y - H mean
+        pull = (before @ delta.unsqueeze(-1)).squeeze(-1)
+        quadratic = (weight * left.square()).sum(-1) + (delta * pull).sum(-1)
+        log_noise = mask.flatten(0, 1) @ (noise.log() + LOG_2PI)
+        ll = (-0.5 * (quadratic + log_noise + log_det)).view(time, batch)
+
         layers = [torch.stack([h[i] for h in hidden]) for i in range(len(hidden[0]))]
         ctx.save_for_backward(
-            reset, restart, C, D, m, mean, torch.stack(inputs), first, *rest, *layers
-        )
+            reset, restart, C, D, wide, delta, left, pull, weight, H, noise, torch.stack(inputs),
+            first, *rest, *layers,
+        )  # fmt: skip
         ctx.network = (residual, activation, len(rest))
         ctx.set_materialize_grads(False)
-        return m, mean, log_det
+        return mean, ll
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, g_m: Tensor | None, g_mean: Tensor | None, g_log_det: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, g_mean: Tensor | None, g_ll: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return the gradient of every input of ``forward``, in its order."""
-        reset, restart, C, D, m, mean, inputs, first = ctx.saved_tensors[:8]
+        reset, restart, C, D, wide, delta, left, pull, weight, H, noise = ctx.saved_tensors[:11]
+        inputs, first = ctx.saved_tensors[11:13]
         residual, activation, count = ctx.network
-        rest, layers = ctx.saved_tensors[8 : 8 + count], ctx.saved_tensors[8 + count :]
+        rest, layers = ctx.saved_tensors[13 : 13 + count], ctx.saved_tensors[13 + count :]
         steps = _Steps(residual, activation, first, rest)
-        g_mean = torch.zeros_like(m) if g_mean is None else g_mean
-        back = _run_back(steps, reset, restart, D, layers, g_mean, g_m, None, None)
+        time, batch, state = inputs.shape
+        flat = (time * batch, state)
+        g_mean = torch.zeros_like(inputs) if g_mean is None else g_mean
+        g = torch.zeros_like(pull[:, :1]) if g_ll is None else g_ll.reshape(-1, 1)
+        by_m = (g * pull).to(inputs.dtype).view_as(inputs)
+        back = _run_back(steps, reset, restart, D, layers, g_mean, by_m, None, None)
 
-        p = C @ back.filtered.view_as(m).unsqueeze(-1).to(C.dtype)  # by b_t - N_t m_t
-        g_gathered = -p @ m.unsqueeze(-2).to(C.dtype)
-        g_precision = -p @ (mean - m).unsqueeze(-2).to(C.dtype)
-        if g_log_det is not None:
-            g_precision = torch.addcmul(g_precision, g_log_det[..., None, None], C)
+        p = (C @ back.filtered.to(C.dtype).unsqueeze(-1)).squeeze(-1)  # by H'Wy + L m
+        Hp = p @ H.t()
+        v = weight * (g * left - Hp)  # minus the gradient by y
+        # sum_t g_t w_ti C_t, for every sensor i at once; C is well scaled, its dtype the loop's.
+        spread = (g * weight).to(inputs.dtype).t() @ C.view(flat[0], -1).to(inputs.dtype)
+        spread = (spread.view(-1, state, state) @ H.to(spread.dtype).unsqueeze(-1)).squeeze(-1)
+        spread = spread.to(H.dtype)
+        g_H = torch.addmm((weight * left).t() @ p, v.t(), wide).sub_(spread)
+        per_entry = weight * (left * (0.5 * g * left - Hp) - 0.5 * g * noise)
+        g_noise = (per_entry.sum(0) + 0.5 * (H * spread).sum(-1)) / noise
+
         was_reset = reset.reshape(-1, 1)
+        half = 0.5 * g
+        rows = -(p + half * delta)
+        g_priors = []
+        for chosen in (~was_reset, was_reset):
+            by = torch.where(chosen, rows, 0.0).t() @ delta
+            both = torch.where(chosen, half, 0.0).t() @ C.view(flat[0], -1)
+            by = by - both.view(state, state)
+            g_priors.append(0.5 * (by + by.t()))
         g_initial_mean = torch.where(was_reset, back.predicted, 0.0).sum(0)
         g_restart = None
         if restart is not None:
-            g_restart = torch.where(restart, back.inputs.view_as(m), 0.0)
+            g_restart = torch.where(restart, back.inputs.view_as(inputs), 0.0)
         weights = steps.weight_grads(
             inputs.flatten(0, 1), [h.flatten(0, 1) for h in layers], back.layers
         )
         return (
-            None, None, g_precision, g_gathered, p.squeeze(-1), None, None, g_restart, back.start,
-            back.layers[0].view(*m.shape[:2], -1), g_initial_mean, *weights,
+            None, None, (-v).to(inputs.dtype).view(time, batch, -1), None, g_H, g_noise, *g_priors,
+            None, None, g_restart, back.start, back.layers[0].view(time, batch, -1),
+            g_initial_mean, *weights,
         )  # fmt: skip
