@@ -17,21 +17,22 @@ import pytest
 import torch
 from filter_problems import Problem, assert_equal, assert_same
 
-from torchrl_drbpn.functional import filter_sequence, filter_step, native
+from torchrl_drbpn.functional import compiled, filter_sequence, filter_step, native
 
+# A compiler that refuses the file is no reason to skip.
 pytestmark = pytest.mark.skipif(
-    native.native_error() is not None, reason="there is no C compiler on this machine"
+    "there is no C compiler" in (compiled.native_error() or ""), reason="no C compiler here"
 )
 
 
 @pytest.fixture
 def forgetful(monkeypatch, tmp_path):
     """No library loaded yet, and an empty cache folder."""
-    for cached in (native._library, native.native_error):
+    for cached in (compiled.load_library, compiled.native_error):
         cached.cache_clear()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     yield tmp_path
-    for cached in (native._library, native.native_error):
+    for cached in (compiled.load_library, compiled.native_error):
         cached.cache_clear()
 
 
@@ -95,12 +96,12 @@ def test_without_a_library_auto_runs_pytorch_and_native_says_why(
 
 
 def test_a_library_is_compiled_once(forgetful):
-    assert native.native_error(torch.float64) is None
+    assert compiled.native_error(torch.float64) is None
     (library,) = forgetful.rglob("*.so")
     written = library.stat().st_mtime_ns
-    for cached in (native._library, native.native_error):
+    for cached in (compiled.load_library, compiled.native_error):
         cached.cache_clear()
-    assert native.native_error(torch.float64) is None
+    assert compiled.native_error(torch.float64) is None
     assert [p for p in forgetful.rglob("*") if p.is_file()] == [library]
     assert library.stat().st_mtime_ns == written
 
@@ -113,3 +114,25 @@ def test_what_it_does_not_take_it_names():
     assert native.native_refusal(model, meta) == "it runs on the CPU"
     wide = Problem(2, 65).model()
     assert native.native_refusal(wide) == "obs is 65, more than 64"
+
+
+@pytest.mark.parametrize(("n", "count"), [(1, 1), (3, 8), (17, 21), (64, 2)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_many_inverses_at_once_are_those_of_lapack(n, count, dtype):
+    g = torch.Generator().manual_seed(n)
+    root = torch.randn(count, n, n, generator=g, dtype=torch.float64)
+    matrix = (root @ root.mT + n * torch.eye(n, dtype=torch.float64)).to(dtype)
+    found = compiled.spd_inverse(matrix.tril())  # the upper triangle is not read
+    assert found is not None
+    tolerance = {"rtol": 1e-4, "atol": 1e-5} if dtype == torch.float32 else {}
+    torch.testing.assert_close(found[0], torch.linalg.inv(matrix), **tolerance)
+    torch.testing.assert_close(found[1], torch.logdet(matrix), **tolerance)
+    spoiled = matrix.clone()
+    spoiled[-1] -= 1e4 * torch.eye(n, dtype=dtype)
+    inverse, _ = compiled.spd_inverse(spoiled)
+    assert inverse[-1].isnan().all()
+    assert torch.equal(inverse[:-1], found[0][:-1])
+
+
+def test_matrices_too_large_for_a_group_go_to_lapack():
+    assert compiled.spd_inverse(torch.eye(65)) is None

@@ -12,6 +12,7 @@ from torchrl_drbpn.functional.calibration import (
     normalised_squared,
     reliability_curve,
 )
+from torchrl_drbpn.functional.compiled import native_error
 from torchrl_drbpn.functional.corruption import (
     MissingnessMechanism,
     OutageRates,
@@ -42,7 +43,6 @@ from torchrl_drbpn.functional.gaussian import (
 )
 from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
 from torchrl_drbpn.functional.model import StateSpace, choose_form, predict_step
-from torchrl_drbpn.functional.native import native_error
 from torchrl_drbpn.functional.particles import (
     DiagonalGaussian,
     Outcome,

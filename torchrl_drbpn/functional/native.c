@@ -185,50 +185,80 @@ void sizes(const int64_t *dims, int64_t *out) {
 
 /* ---------------------------------------------------------------- the innovation covariances */
 
-/* Factorise and invert M (H P H' + R) M' of LANES rows; a row that fails becomes NaN alone. */
+/* I = inv(A), det = log|A| of LANES matrices; A holds lower triangles and becomes their factors. A
+ * matrix that cannot be factorised becomes NaN alone. */
+static void invert_lanes(long n, vec *A, vec *X, vec *I, vec *det) {
+    vec sum = {0};
+    for (long i = 0; i < n; i++)
+        for (long j = 0; j <= i; j++) {
+            vec c = A[i * n + j];
+            for (long k = 0; k < j; k++) c -= A[i * n + k] * A[j * n + k];
+            if (i > j) {
+                A[i * n + j] = c * X[j * n + j];
+                continue;
+            }
+            for (long l = 0; l < LANES; l++) c[l] = sizeof(real) == 4 ? sqrtf(c[l]) : sqrt(c[l]);
+            A[i * n + i] = c, X[i * n + i] = 1 / c;
+            for (long l = 0; l < LANES; l++)
+                sum[l] += 2 * (sizeof(real) == 4 ? logf(c[l]) : log(c[l]));
+        }
+    *det = sum;
+    for (long j = 0; j < n; j++) /* X = inv(factor) */
+        for (long i = j + 1; i < n; i++) {
+            vec c = {0};
+            for (long k = j; k < i; k++) c -= A[i * n + k] * X[k * n + j];
+            X[i * n + j] = c * X[i * n + i];
+        }
+    for (long i = 0; i < n; i++)
+        for (long j = 0; j <= i; j++) { /* X' X */
+            vec c = {0};
+            for (long k = i; k < n; k++) c += X[k * n + i] * X[k * n + j];
+            I[i * n + j] = I[j * n + i] = c;
+        }
+}
+
+/* The same for `count` whole matrices in rows, for the forms that are not in this file. */
+void spd_inverse(long n, long count, const real *matrix, real *inverse, real *log_det,
+                 real *scratch) {
+    real *A = scratch, *X = A + n * n * LANES, *I = X + n * n * LANES;
+    for (long first = 0; first < count; first += LANES) {
+        vec det;
+        for (long l = 0; l < LANES; l++) {
+            const real *from = matrix + (first + l < count ? first + l : count - 1) * n * n;
+            for (long i = 0; i < n; i++)
+                for (long j = 0; j <= i; j++) A[(i * n + j) * LANES + l] = from[i * n + j];
+        }
+        invert_lanes(n, (vec *)A, (vec *)X, (vec *)I, &det);
+        for (long l = 0; l < LANES && first + l < count; l++) {
+            real *to = inverse + (first + l) * n * n;
+            for (long i = 0; i < n * n; i++) to[i] = I[i * LANES + l];
+            log_det[first + l] = det[l];
+        }
+    }
+}
+
+/* Invert M (H P H' + R) M' of LANES rows; the inverse is zero where nothing was observed. */
 static void invert(const Sizes *s, const Ahead *a, long group, const uint8_t *observed,
                    const uint8_t *reset, real *inverse, real *log_det) {
     long n = s->obs;
-    vec mask[n], again = {0}, pivot[n];
-    vec *L = (vec *)a->factor, *X = (vec *)a->lower, *I = (vec *)inverse;
+    vec mask[n], again = {0}, *A = (vec *)a->factor, *I = (vec *)inverse;
     for (long l = 0; l < LANES; l++) {
         long r = group * LANES + l < s->rows ? group * LANES + l : s->rows - 1;
         long from = (r % s->batch) * s->time + r / s->batch;
         again[l] = reset[from];
         for (long i = 0; i < n; i++) mask[i][l] = observed[from * n + i];
     }
-    vec det = {0};
     for (long i = 0; i < n; i++)
         for (long j = 0; j <= i; j++) {
             /* Weights of exactly 0 or 1 choose exactly. */
             vec c = (1 - again) * a->cov[0][i * s->N + j] + again * a->cov[1][i * s->N + j];
             c *= mask[i] * mask[j];
             if (i == j) c += 1 - mask[i];
-            for (long k = 0; k < j; k++) c -= L[i * n + k] * L[j * n + k];
-            if (i > j) {
-                L[i * n + j] = c * pivot[j];
-                continue;
-            }
-            for (long l = 0; l < LANES; l++) c[l] = sizeof(real) == 4 ? sqrtf(c[l]) : sqrt(c[l]);
-            L[i * n + i] = c, pivot[i] = 1 / c;
-            for (long l = 0; l < LANES; l++)
-                det[l] += 2 * (sizeof(real) == 4 ? logf(c[l]) : log(c[l]));
+            A[i * n + j] = c;
         }
-    memcpy(log_det, &det, sizeof det);
-    for (long j = 0; j < n; j++) { /* X = inv(L) */
-        X[j * n + j] = pivot[j];
-        for (long i = j + 1; i < n; i++) {
-            vec c = {0};
-            for (long k = j; k < i; k++) c -= L[i * n + k] * X[k * n + j];
-            X[i * n + j] = c * pivot[i];
-        }
-    }
+    invert_lanes(n, A, (vec *)a->lower, I, (vec *)log_det);
     for (long i = 0; i < n; i++)
-        for (long j = 0; j <= i; j++) { /* X' X, only where observed */
-            vec c = {0};
-            for (long k = i; k < n; k++) c += X[k * n + i] * X[k * n + j];
-            I[i * n + j] = I[j * n + i] = c * mask[i] * mask[j];
-        }
+        for (long j = 0; j < n; j++) I[i * n + j] *= mask[i] * mask[j];
 }
 
 /* out[r] = inverse_r in[r] for the rows of one step; `in` starts at its first row. */

@@ -3,104 +3,27 @@
 At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
 time between the operations of the filter, not in them. ``native.c`` holds the same sums as
 :class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and is held to the same oracles.
-It is compiled once for a machine, when it is first used, by the C compiler found in ``CC`` or on
-the path, into the user's cache folder; where there is none, the PyTorch form runs.
+:mod:`.compiled` compiles it; where it cannot, the PyTorch form runs.
 """
 
 from __future__ import annotations
 
 import ctypes
-import functools
-import hashlib
-import os
-import platform
-import shlex
-import shutil
-import subprocess
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torchrl_drbpn.functional.compiled import load_library, native_error
 from torchrl_drbpn.functional.model import StateSpace
 from torchrl_drbpn.functional.recurrence import MeanNetwork
 
-__all__ = ["NativeRecurrence", "native_error", "native_refusal"]
+__all__ = ["NativeRecurrence", "native_refusal"]
 
-_SOURCE = Path(__file__).with_name("native.c")
 _CPU = torch.device("cpu")
-_REALS = {torch.float32: "float", torch.float64: "double"}
-# Vectors of the width that PyTorch found: the compiled file then runs wherever its name is equal.
-_MACHINE_FLAGS = {"AVX512": ["-march=x86-64-v4"], "AVX2": ["-march=x86-64-v3"]}
-# Without errno and traps roots and choices become vector instructions; sums keep their order.
-_FLAGS = ["-O3", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
 _MAX_OBS = 64  # the batched factorisation keeps a group of matrices in cache up to here
 _MAX_LAYERS = 15
-
-
-class NativeError(RuntimeError):
-    """Say why the C form cannot be had on this machine."""
-
-
-@functools.cache
-def _library(dtype: torch.dtype) -> ctypes.CDLL:
-    """Compile once, then load."""
-    if os.environ.get("TORCHRL_DRBPN_NATIVE", "1") == "0":
-        raise NativeError("TORCHRL_DRBPN_NATIVE=0 switches it off")
-    named = shlex.split(os.environ.get("CC", ""))
-    compiler = named or [next(filter(shutil.which, ("cc", "gcc", "clang")), "")]
-    if not compiler[0] or shutil.which(compiler[0]) is None:
-        raise NativeError("there is no C compiler: install gcc or clang, or name one in CC")
-    flags = [*_FLAGS, *_MACHINE_FLAGS.get(torch.backends.cpu.get_cpu_capability(), [])]
-    command = [*compiler, *flags, f"-DREAL={_REALS[dtype]}"]
-    text = "\n".join([*command, platform.machine(), _SOURCE.read_text(encoding="utf-8")])
-    name = f"native-{_REALS[dtype]}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.so"
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    path = Path(cache) / "torchrl_drbpn" / name
-    try:
-        if not path.is_file():
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-                built = Path(folder) / name
-                done = subprocess.run(
-                    [*command, "-o", str(built), str(_SOURCE), "-lm"],
-                    capture_output=True,
-                    text=True,
-                    check=False,
-                )
-                if done.returncode:
-                    reason = " ".join(done.stderr.split())[:300]
-                    raise NativeError(f"`{compiler[0]}` refused native.c: {reason}")
-                built.replace(path)  # whole or not at all, whoever else compiles it now
-        return ctypes.CDLL(str(path))
-    except OSError as error:
-        raise NativeError(f"it could not be built or loaded: {error}") from error
-
-
-@functools.cache
-def native_error(dtype: torch.dtype = torch.float32) -> str | None:
-    """Say why the C form cannot be had on this machine; compiles it where that is still to do.
-
-    Args:
-        dtype: of the filter's tensors.
-
-    Returns:
-        None where it can be had, else the reason.
-
-    Example:
-        >>> native_error(torch.float16)
-        'there is no C form for torch.float16'
-    """
-    if dtype not in _REALS:
-        return f"there is no C form for {dtype}"
-    try:
-        _library(dtype)
-    except NativeError as error:
-        return str(error)
-    return None
 
 
 def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
@@ -167,7 +90,7 @@ class NativeRecurrence(torch.autograd.Function):
             R.ndim == 2, start.stride(0), *widths,
         ]  # fmt: skip
         dims = (ctypes.c_int64 * len(numbers))(*numbers)
-        library = _library(x.dtype)
+        library = load_library(x.dtype)
         counts = (ctypes.c_int64 * 3)()
         library.sizes(dims, counts)
         tape, scratch = x.new_empty(counts[0]), x.new_empty(counts[1])
@@ -200,7 +123,7 @@ class NativeRecurrence(torch.autograd.Function):
         g_initial = tape.new_empty(state)
         of_layers = [torch.empty_like(v) for v in layers]
         _call(
-            _library(tape.dtype).backward,
+            load_library(tape.dtype).backward,
             ctx.dims,
             [
                 None if g_mean is None else g_mean.contiguous(),

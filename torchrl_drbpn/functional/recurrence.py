@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from torchrl_drbpn.functional.compiled import spd_inverse
 from torchrl_drbpn.functional.gaussian import LOG_2PI
 
 __all__ = ["ACTIVATIONS", "InformationRecurrence", "InnovationRecurrence", "MeanNetwork"]
@@ -254,6 +255,9 @@ def _spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
     One item that fails (it cannot while the noise floors hold) turns into NaN by itself instead
     of failing the whole batch, without a synchronisation or a branch.
     """
+    found = spd_inverse(matrix)
+    if found is not None:
+        return found
     factor, info = torch.linalg.cholesky_ex(matrix)
     failed = (info != 0).unsqueeze(-1)
     # cholesky_inverse refuses a zero on the diagonal; only the diagonal is touched, it is small

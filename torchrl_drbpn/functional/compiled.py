@@ -1,0 +1,147 @@
+"""The filter's C code: compiled once for a machine, when it is first used.
+
+The C compiler is the one named in ``CC`` or found on the path; the library goes into the user's
+cache folder (``XDG_CACHE_HOME``, else ``~/.cache``), under a name that holds its source, the
+compiler's command and the width of the processor's vectors. ``TORCHRL_DRBPN_NATIVE=0`` switches it
+off. Where it cannot be had, every function of the package runs in PyTorch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+__all__ = ["NativeError", "load_library", "native_error", "spd_inverse"]
+
+_SOURCE = Path(__file__).with_name("native.c")
+_MAX_SIZE = 64  # a group of matrices stays in cache up to here
+_REALS = {torch.float32: "float", torch.float64: "double"}
+# Vectors of the width that PyTorch found: the compiled file then runs wherever its name is equal.
+_MACHINE_FLAGS = {"AVX512": ["-march=x86-64-v4"], "AVX2": ["-march=x86-64-v3"]}
+# Without errno and traps roots and choices become vector instructions; sums keep their order.
+_FLAGS = ["-O3", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
+
+
+class NativeError(RuntimeError):
+    """Say why the C form cannot be had on this machine."""
+
+
+@functools.cache
+def load_library(dtype: torch.dtype) -> ctypes.CDLL:
+    """Load ``native.c``, compiled for a dtype; compile it where that is still to do.
+
+    Args:
+        dtype: ``torch.float32`` or ``torch.float64``.
+
+    Returns:
+        Its functions.
+
+    Raises:
+        NativeError: with the reason, where it cannot be had.
+
+    Example:
+        >>> import torch
+        >>> native_error() is not None or hasattr(load_library(torch.float32), "spd_inverse")
+        True
+    """
+    if os.environ.get("TORCHRL_DRBPN_NATIVE", "1") == "0":
+        raise NativeError("TORCHRL_DRBPN_NATIVE=0 switches it off")
+    named = shlex.split(os.environ.get("CC", ""))
+    compiler = named or [next(filter(shutil.which, ("cc", "gcc", "clang")), "")]
+    if not compiler[0] or shutil.which(compiler[0]) is None:
+        raise NativeError("there is no C compiler: install gcc or clang, or name one in CC")
+    flags = [*_FLAGS, *_MACHINE_FLAGS.get(torch.backends.cpu.get_cpu_capability(), [])]
+    command = [*compiler, *flags, f"-DREAL={_REALS[dtype]}"]
+    text = "\n".join([*command, platform.machine(), _SOURCE.read_text(encoding="utf-8")])
+    name = f"native-{_REALS[dtype]}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.so"
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    path = Path(cache) / "torchrl_drbpn" / name
+    try:
+        if not path.is_file():
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+                built = Path(folder) / name
+                done = subprocess.run(
+                    [*command, "-o", str(built), str(_SOURCE), "-lm"],
+                    capture_output=True,
+                    text=True,
+                    check=False,
+                )
+                if done.returncode:
+                    reason = " ".join(done.stderr.split())[:300]
+                    raise NativeError(f"`{compiler[0]}` refused native.c: {reason}")
+                built.replace(path)  # whole or not at all, whoever else compiles it now
+        return ctypes.CDLL(str(path))
+    except OSError as error:
+        raise NativeError(f"it could not be built or loaded: {error}") from error
+
+
+@functools.cache
+def native_error(dtype: torch.dtype = torch.float32) -> str | None:
+    """Say why the C form cannot be had on this machine; compiles it where that is still to do.
+
+    Args:
+        dtype: of the filter's tensors.
+
+    Returns:
+        None where it can be had, else the reason.
+
+    Example:
+        >>> native_error(torch.float16)
+        'there is no C form for torch.float16'
+    """
+    if dtype not in _REALS:
+        return f"there is no C form for {dtype}"
+    try:
+        load_library(dtype)
+    except NativeError as error:
+        return str(error)
+    return None
+
+
+def spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Invert many small symmetric positive definite matrices, without a gradient.
+
+    Sixteen (float64: eight) at a time, where LAPACK takes one after the other.
+
+    Args:
+        matrix: shape ``(*batch, n, n)``; lower triangles are read.
+
+    Returns:
+        Inverses, shape ``(*batch, n, n)``, and log-determinants, shape ``(*batch,)``; NaN for a
+        matrix that is not positive definite. None where the C code does not run.
+
+    Example:
+        >>> import torch
+        >>> found = spd_inverse(2 * torch.eye(3).expand(5, 3, 3))
+        >>> found is None or torch.allclose(found[0][4], torch.eye(3) / 2)
+        True
+    """
+    n, dtype = matrix.shape[-1], matrix.dtype
+    if (
+        matrix.device.type != "cpu"
+        or n > _MAX_SIZE
+        or torch.compiler.is_compiling()
+        or native_error(dtype) is not None
+    ):
+        return None
+    matrix = matrix.contiguous()
+    inverse, log_det = torch.empty_like(matrix), matrix.new_empty(matrix.shape[:-2])
+    scratch = matrix.new_empty(3 * n * n * 64 // matrix.element_size())
+    load_library(dtype).spd_inverse(
+        ctypes.c_long(n),
+        ctypes.c_long(log_det.numel()),
+        *(ctypes.c_void_p(x.data_ptr()) for x in (matrix, inverse, log_det, scratch)),
+    )
+    return inverse, log_det
