@@ -2,9 +2,10 @@
 
 Written here, since no library has these steps. Tried with torch 2.13: curvlinops 3.0.1 gives the
 Kronecker factors of one data set under a mean squared error, without their running average, a
-learned standard deviation or a step, and asks for eight further packages; singd 0.0.5 estimates
+learned standard deviation or a step, and asks for six further packages; singd 0.0.5 estimates
 the curvature from the gradients of the loss itself (the empirical Fisher matrix); nngeometry 0.4
-and asdl 0.1.5 keep no running average; kfac-pytorch is not on PyPI.
+has no running average and no step; kfac-pytorch is not on PyPI, and the asdl there is another
+package.
 
 [K-FAC] J. Martens and R. Grosse, Optimizing Neural Networks with Kronecker-factored Approximate
 Curvature, ICML 2015. [ACKTR] Y. Wu et al., Scalable trust-region method for deep reinforcement
