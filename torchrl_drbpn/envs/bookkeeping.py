@@ -9,7 +9,7 @@ transforms stay in the chain, with their specs, and do the work themselves every
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict
@@ -66,7 +66,7 @@ def _reward_sum(part: RewardSum) -> Short | None:
             if reward not in following or total not in root:
                 return False
         for reward, total in pairs:
-            following[total] = root[total] + following[reward]  # type: ignore[operator]
+            following[total] = root[total] + following[reward]
         return True
 
     return Short(step, zeroed=list(part.out_keys))
@@ -79,7 +79,7 @@ def _step_counter(part: StepCounter) -> Short | None:
 
     def step(root: _Entries, following: _Entries) -> bool:
         for key in keys:
-            following[key] = root[key] + 1  # type: ignore[operator]
+            following[key] = root[key] + 1
         return True
 
     return Short(step, zeroed=keys)
@@ -94,7 +94,7 @@ def _init_tracker(part: InitTracker) -> Short | None:
         del root
         for key in keys:
             if key not in following:
-                following[key] = torch.zeros_like(following["done"])  # type: ignore[arg-type]
+                following[key] = torch.zeros_like(following["done"])
         return True
 
     return Short(step, flagged=keys)
@@ -132,7 +132,7 @@ def holds(entries: _Entries, key: NestedKey) -> bool:
     """
     path = (key,) if isinstance(key, str) else key
     for name in path[:-1]:
-        inner = entries.get(name)
+        inner: Any = entries.get(name)
         if type(inner) is not TensorDict:
             return False
         entries = inner._tensordict
