@@ -8,13 +8,13 @@ shows what complete sensors would have shown, what arrived, and the belief with 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import hydra
+import numpy as np
 import torch
-from assembly.belief_figure import draw_belief, frame_steps, most_missing, save_figure
+from assembly.belief_figure import chosen_sensors, draw_belief, frame_steps, save_figure
 from assembly.console import run_or_explain, say
 from assembly.errors import UserError
 from assembly.frames import render_poses
@@ -56,6 +56,11 @@ def run(config: dict[str, Any]) -> int:
         start=config["start"],
         steps=config["steps"],
     )
+    if recording.told != "estimate" or np.isnan(recording.std).any():
+        raise UserError(
+            f"`belief={trained.settings.belief.get('name')}` keeps no Gaussian belief to draw: "
+            "take a run with belief=drbpn, or recipes/play.py."
+        )
     sensors = chosen_sensors(recording, config["sensors"])
     frames = _frames(recording, config["frames"])
     figure = draw_belief(
@@ -71,35 +76,6 @@ def run(config: dict[str, Any]) -> int:
         f"of the missing entries; written: {out}"
     )
     return 0
-
-
-def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]) -> list[int]:
-    """Return the sensors to draw.
-
-    Args:
-        recording: of an episode.
-        wanted: how many of those that miss most, or names or numbers of components.
-
-    Returns:
-        Indices of components.
-
-    Raises:
-        UserError: if there is no such sensor.
-    """
-    names = recording.names
-    if isinstance(wanted, int):
-        if wanted < 1:
-            raise UserError(f"`sensors` must be 1 or more, or a list, got {wanted}.")
-        return most_missing(recording, wanted)
-    indices = []
-    for item in [wanted] if isinstance(wanted, str) else wanted:
-        index = names.index(item) if item in names else item
-        if not isinstance(index, int) or not 0 <= index < len(names):
-            shown = ", ".join(f"{i} {name}" for i, name in enumerate(names[:20]))
-            more = ", ..." if len(names) > 20 else ""
-            raise UserError(f"`sensors` must be among {shown}{more}; got {item!r}.")
-        indices.append(index)
-    return indices
 
 
 def _frames(recording: Recording, count: int) -> list[Any]:

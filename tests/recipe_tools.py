@@ -32,6 +32,25 @@ def make_config(*overrides: str) -> dict[str, Any]:
     return {str(key): value for key, value in composed.items()}
 
 
+def make_folder(folder: Path, *overrides: str) -> Path:
+    """Leave a run folder with a checkpoint after one rollout with two fifths of it missing."""
+    from assembly.checkpoint import save_checkpoint
+    from assembly.run_folder import write_config
+    from assembly.settings import read_settings
+    from assembly.training import assemble, train_rollout, training_state
+
+    smoke = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
+    config = make_config(*smoke, *overrides)
+    folder.mkdir()
+    with torch.random.fork_rng(devices=[]):
+        settings = read_settings(config)
+        training = assemble(settings)
+        train_rollout(training, settings)
+        save_checkpoint(folder, training.progress.frames, training_state(training), keep=1)
+    write_config(folder, config)
+    return folder
+
+
 def read_table(path: Path) -> list[dict[str, str]]:
     """Read a CSV file without the columns that tell times."""
     with path.open(newline="") as file:

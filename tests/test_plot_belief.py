@@ -19,23 +19,18 @@ import torch
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from recipe_tools import make_config  # isort: skip
+from recipe_tools import make_config, make_folder  # isort: skip
 
 import plot_belief
 from assembly.belief_figure import draw_belief, frame_steps, most_missing, save_figure
-from assembly.checkpoint import save_checkpoint
 from assembly.errors import UserError
 from assembly.frames import render_poses
 from assembly.points import read_point
 from assembly.recording import Recording, record_episode
-from assembly.run_folder import write_config
 from assembly.sensors import named_tasks, sensor_names
-from assembly.settings import read_settings
 from assembly.trained import load_trained_agent
-from assembly.training import assemble, train_rollout, training_state
 from matplotlib.image import imread
 
-SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
 DEFAULTS = {"mode": "sampled", "start": 0, "steps": 12, "sensors": 2, "frames": 0, "seed": 4}
 
 
@@ -46,19 +41,6 @@ def _global_state() -> Iterator[None]:
     with torch.random.fork_rng(devices=[]):
         yield
     torch.set_num_threads(threads)
-
-
-def make_folder(folder: Path, *overrides: str) -> Path:
-    """Leave a run folder with a checkpoint after one rollout."""
-    config = make_config(*SMOKE, *overrides)
-    folder.mkdir()
-    with torch.random.fork_rng(devices=[]):
-        settings = read_settings(config)
-        training = assemble(settings)
-        train_rollout(training, settings)
-        save_checkpoint(folder, training.progress.frames, training_state(training), keep=1)
-    write_config(folder, config)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +106,7 @@ def test_sensors_that_miss_most_come_first_in_choice_and_stay_in_order() -> None
     observed = np.array([[1, 0, 1, 0], [1, 0, 0, 0], [1, 1, 0, 0]], dtype=bool)
     recording = Recording(
         "T", list("abcd"), 0, *[np.zeros((3, 4))] * 2, observed, *[np.zeros((3, 4))] * 2,
-        np.zeros(4), [], np.zeros(3), None,
+        [], np.zeros(3), None,
     )  # fmt: skip
     assert most_missing(recording, 1) == [3]
     assert most_missing(recording, 3) == [1, 2, 3]
@@ -251,4 +233,4 @@ def test_bad_input_is_answered_with_one_line(
 def test_an_agent_without_a_belief_is_refused(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "none", "belief=none")
     with pytest.raises(UserError, match="`belief=none` keeps no Gaussian belief"):
-        record(folder)
+        draw(folder, tmp_path / "belief.png")

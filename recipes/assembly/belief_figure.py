@@ -13,10 +13,12 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from PIL import Image
 
+from assembly.errors import UserError
 from assembly.recording import INTERVAL_95, Recording
 
-_TRUTH, _ARRIVED, _BELIEF, _MISSING = "#222222", "#111111", "#1f77c4", "#f8ddd2"
-_DASHES = (0, (3, 1.5))
+TRUTH, ARRIVED, BELIEF, MISSING = "#222222", "#111111", "#1f77c4", "#f8ddd2"
+ABSENT = "#e3997f"  # an entry of a mask that did not arrive
+DASHES = (0, (3, 1.5))
 _WIDTH_INCHES, _PANEL_INCHES, _STRIP_INCHES, _MASK_INCHES = 10.0, 1.05, 1.55, 0.75
 STYLE = {
     "font.size": 9.5,
@@ -43,6 +45,35 @@ def most_missing(recording: Recording, count: int) -> list[int]:
     missed = (~recording.observed).sum(0)
     ranked = np.argsort(-missed, kind="stable")[:count]
     return sorted(int(i) for i in ranked)
+
+
+def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]) -> list[int]:
+    """Return the sensors to draw.
+
+    Args:
+        recording: of an episode.
+        wanted: how many of those that miss most, or names or numbers of components.
+
+    Returns:
+        Indices of components.
+
+    Raises:
+        UserError: if there is no such sensor.
+    """
+    names = recording.names
+    if isinstance(wanted, int):
+        if wanted < 1:
+            raise UserError(f"`sensors` must be 1 or more, or a list, got {wanted}.")
+        return most_missing(recording, wanted)
+    indices = []
+    for item in [wanted] if isinstance(wanted, str) else wanted:
+        index = names.index(item) if item in names else item
+        if not isinstance(index, int) or not 0 <= index < len(names):
+            shown = ", ".join(f"{i} {name}" for i, name in enumerate(names[:20]))
+            more = ", ..." if len(names) > 20 else ""
+            raise UserError(f"`sensors` must be among {shown}{more}; got {item!r}.")
+        indices.append(index)
+    return indices
 
 
 def draw_belief(
@@ -156,7 +187,7 @@ def _draw_mask(axis: Any, recording: Recording) -> None:
         extent=(time[0] - 0.5, time[-1] + 0.5, count, 0),
         aspect="auto",
         interpolation="nearest",
-        cmap=mpl.colors.ListedColormap(["white", "#e3997f"]),
+        cmap=mpl.colors.ListedColormap(["white", ABSENT]),
         vmin=0,
         vmax=1,
     )
@@ -173,13 +204,13 @@ def _draw_sensor(axis: Any, recording: Recording, sensor: int) -> None:
     time = _time(recording)
     seen = recording.observed[:, sensor]
     for start, stop in _runs(~seen):
-        axis.axvspan(time[start] - 0.5, time[stop - 1] + 0.5, color=_MISSING, lw=0, zorder=0)
+        axis.axvspan(time[start] - 0.5, time[stop - 1] + 0.5, color=MISSING, lw=0, zorder=0)
     mean, band = recording.estimate[:, sensor], INTERVAL_95 * recording.std[:, sensor]
-    axis.fill_between(time, mean - band, mean + band, color=_BELIEF, alpha=0.3, lw=0, zorder=2)
-    axis.plot(time, mean, color=_BELIEF, lw=2.2, alpha=0.75, zorder=3)
-    axis.plot(time, recording.complete[:, sensor], color=_TRUTH, lw=0.9, ls=_DASHES, zorder=4)
+    axis.fill_between(time, mean - band, mean + band, color=BELIEF, alpha=0.3, lw=0, zorder=2)
+    axis.plot(time, mean, color=BELIEF, lw=2.2, alpha=0.75, zorder=3)
+    axis.plot(time, recording.complete[:, sensor], color=TRUTH, lw=0.9, ls=DASHES, zorder=4)
     axis.plot(
-        time[seen], recording.arrived[seen, sensor], ".", color=_ARRIVED, ms=4.5, mew=0, zorder=5
+        time[seen], recording.arrived[seen, sensor], ".", color=ARRIVED, ms=4.5, mew=0, zorder=5
     )
     missing = 100 * (1 - seen.mean())
     axis.set_title(f"{recording.names[sensor]}  ({missing:.0f} % missing)")
@@ -196,12 +227,12 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
 def _legend() -> list[Any]:
     line = mpl.lines.Line2D
     return [
-        line([], [], color=_TRUTH, lw=0.9, ls=_DASHES, label="true value, unknown to the agent"),
-        line([], [], color=_ARRIVED, marker=".", ls="", ms=7, mew=0, label="what arrived"),
-        Patch(color=_MISSING, label="nothing arrived"),
+        line([], [], color=TRUTH, lw=0.9, ls=DASHES, label="true value, unknown to the agent"),
+        line([], [], color=ARRIVED, marker=".", ls="", ms=7, mew=0, label="what arrived"),
+        Patch(color=MISSING, label="nothing arrived"),
         Patch(
-            facecolor=(*mpl.colors.to_rgb(_BELIEF), 0.3),
-            edgecolor=_BELIEF,
+            facecolor=(*mpl.colors.to_rgb(BELIEF), 0.3),
+            edgecolor=BELIEF,
             label="belief and its 95 % interval",
         ),
     ]

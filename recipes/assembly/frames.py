@@ -51,6 +51,9 @@ def render_poses(
     # What lies flat turns: its longest side has to fit in both directions.
     across, upward = (extent.max(), extent.max()) if flat else (extent[0], extent[2])
     size = max(float(upward), float(across) * height / width)
+    # MuJoCo draws no picture larger than its buffer.
+    plain.vis.global_.offwidth = max(plain.vis.global_.offwidth, width)
+    plain.vis.global_.offheight = max(plain.vis.global_.offheight, height)
     sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX in plain.tex_type
     try:
         from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from assembly.beliefs import ESTIMATE, ESTIMATE_VARIANCE, FORECAST, FORECAST_COV
 from assembly.environment import copy_statistics
 from assembly.errors import UserError
 from assembly.evaluation import make_evaluation_environment
 from assembly.sensors import sensor_names
-from assembly.settings import MissingnessSettings
+from assembly.settings import MissingnessSettings, NoiseSettings
 from assembly.trained import TrainedAgent
-from torchrl_drbpn import BeliefFilterModule, SensorReduction, seed_env
+from torchrl_drbpn import seed_env
+from torchrl_drbpn.functional import zero_missing
 
 INTERVAL_95 = 1.959964  # half width of a normal's central 95 %, in standard deviations
+# What a belief says of the sensors: their values after looking, the readings before, or nothing.
+Told = Literal["estimate", "forecast", "nothing"]
 _MODES = {"sampled": ExplorationType.RANDOM, "mean": ExplorationType.DETERMINISTIC}
 
 
@@ -35,13 +40,15 @@ class Recording:
         complete: what complete, noiseless sensors would have shown, shape ``(time, obs)``.
         arrived: what arrived, 0 where nothing did, shape ``(time, obs)``.
         observed: bool, True where something arrived, shape ``(time, obs)``.
-        estimate: every sensor's value by the filtered belief, shape ``(time, obs)``.
-        std: its standard deviation by the filtered covariance, root of the diagonal of H P H',
-            shape ``(time, obs)``.
-        noise_std: standard deviation of the learned sensor noise R, shape ``(obs,)``.
+        estimate: what the belief says of every sensor, shape ``(time, obs)``; NaN where it says
+            nothing.
+        std: its standard deviation, of the belief filter the root of the diagonal of H P H', shape
+            ``(time, obs)``; NaN where the belief has none.
         poses: simulator positions and velocities at each step.
         rewards: raw, shape ``(time,)``.
         model: the simulator's MuJoCo model.
+        told: what ``estimate`` is: the sensor's value by what arrived until this step, the reading
+            foreseen from the step before, or nothing.
     """
 
     task: str
@@ -52,10 +59,10 @@ class Recording:
     observed: NDArray[np.bool_]
     estimate: NDArray[np.float64]
     std: NDArray[np.float64]
-    noise_std: NDArray[np.float64]
     poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
     rewards: NDArray[np.float64]
     model: Any
+    told: Told = "estimate"
 
     @property
     def missing_ratio(self) -> float:
@@ -64,9 +71,9 @@ class Recording:
 
     @property
     def coverage(self) -> float:
-        """Return the share of missing entries inside their 95 % interval; NaN for none missing."""
+        """Return the share of missing entries inside their 95 % interval; NaN if there is none."""
         missing = ~self.observed
-        if not missing.any():
+        if not missing.any() or np.isnan(self.std).any():
             return float("nan")
         inside = np.abs(self.complete - self.estimate) < INTERVAL_95 * self.std
         return float(inside[missing].mean())
@@ -80,51 +87,60 @@ def record_episode(
     seed: int,
     start: int,
     steps: int,
+    noise: NoiseSettings | None = None,
+    removed: Sequence[int] = (),
 ) -> Recording:
     """Let a trained agent act and write down what it saw, missed and believed.
 
     Args:
-        trained: the agent; its belief must be the belief filter.
+        trained: the agent.
         missingness: what does not arrive.
         mode: ``sampled`` actions or ``mean`` actions.
         seed: of the episode, the corruption and sampled actions.
         start: steps of the episode to leave out.
         steps: steps to keep; fewer where the episode ends before.
+        noise: what is added to what arrives; None: as in training.
+        removed: components that never arrive, on top of ``missingness``.
 
     Returns:
         The recording.
 
     Raises:
-        UserError: if the agent keeps no Gaussian belief, the task is not MuJoCo's, or the
-            episode is over before ``start``.
+        UserError: if the task is not MuJoCo's, or the episode is over before ``start``.
     """
     # Poses are read from Gymnasium's simulators, whatever the agent was trained on.
     task = replace(trained.settings.env, backend="gymnasium")
     settings = replace(trained.settings, env=task)
-    policy = TensorDictSequential(_observing_belief(trained), trained.agent.actor)
+    make = trained.belief.observing
+    belief = trained.agent.belief if make is None else make()
+    policy = TensorDictSequential(belief, trained.agent.actor)
     env = make_evaluation_environment(
-        settings, trained.belief, trained.agent, episodes=1, missingness=missingness
+        settings,
+        trained.belief,
+        trained.agent,
+        episodes=1,
+        missingness=missingness,
+        noise=noise,
+        complete=True,
+        removed=removed,
     )
-    # Takes nothing away: it stands before every corruption and writes down what it sees.
-    env.insert_transform(0, SensorReduction([], complete_key="complete_observation"))
     copy_statistics(trained.statistics, env)
     simulator = env.base_env.envs[0].unwrapped
     if not hasattr(simulator, "data"):
         raise UserError(f"`{settings.env.env_id}` is not a MuJoCo task: its poses are not known.")
-    emission = trained.agent.belief.filter.emission
     rows: list[tuple[torch.Tensor, ...]] = []
     poses, rewards = [], []
     with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(_MODES[mode]):
         torch.manual_seed(seed)
         seed_env(env, seed)
-        H, noise = emission.matrix.double(), emission.cov().double()
         data = env.reset()
         for step in range(start + steps):
             pose = simulator.data.qpos.copy(), simulator.data.qvel.copy()
             data = policy(data)
             if step >= start:
                 poses.append(pose)
-                rows.append(_sensors(data, H))
+                rows.append(_sensors(data))
+                told = _told(data)
             data = env.step(data)
             if step >= start:
                 rewards.append(data["next", "reward"].item())
@@ -144,39 +160,36 @@ def record_episode(
         observed,
         estimate,
         std,
-        noise.diagonal().sqrt().numpy(),
         poses,
         np.array(rewards),
         simulator.model,
+        told,
     )
     env.close()
     return out
 
 
-def _observing_belief(trained: TrainedAgent) -> TensorDictModule:
-    """Return the agent's belief module, asked for covariance and sensor estimates as well."""
-    module = trained.agent.belief
-    if not isinstance(module, BeliefFilterModule):
-        raise UserError(
-            f"`belief={trained.settings.belief.get('name')}` keeps no Gaussian belief to draw: "
-            "take a run with belief=drbpn."
-        )
-    wanted = ("features", "mean", "log_likelihood", "cov", "observation")
-    return BeliefFilterModule(
-        module.filter,
-        policy_input=module.policy_input,
-        out_keys=[name if name == "features" else ("belief", name) for name in wanted],
-    )
+def _told(data: TensorDictBase) -> Told:
+    """Say what the belief has written of the sensors; what it says after looking goes first."""
+    keys = data.keys(include_nested=True)
+    if ESTIMATE in keys:
+        return "estimate"
+    return "forecast" if FORECAST in keys else "nothing"
 
 
-def _sensors(data: TensorDictBase, H: torch.Tensor) -> tuple[torch.Tensor, ...]:
+def _sensors(data: TensorDictBase) -> tuple[torch.Tensor, ...]:
     """Return complete, arrived, observed, estimate and its deviation, shape (obs,) each."""
     data = data[0]
-    cov = H @ data["belief", "cov"].double() @ H.mT
+    complete, observed = data["complete_observation"].double(), data["observed"].clone()
+    unknown = torch.full_like(complete, torch.nan)
+    estimate, variance = data.get(ESTIMATE, None), data.get(ESTIMATE_VARIANCE, None)
+    if estimate is None:
+        estimate, cov = data.get(FORECAST, unknown), data.get(FORECAST_COV, None)
+        variance = None if cov is None else cov.diagonal()
     return (
-        data["complete_observation"].double(),
-        data["observation"].double(),
-        data["observed"].clone(),
-        data["belief", "observation"].double(),
-        cov.diagonal().clamp_min(0).sqrt(),
+        complete,
+        zero_missing(data["observation"], observed).double(),
+        observed,
+        estimate.double(),
+        unknown if variance is None else variance.double().clamp_min(0).sqrt(),
     )
