@@ -4,7 +4,8 @@ Its values and gradients are held to the row-deleting oracle beside the other fo
 test_functional_filtering.py. Specified here:
 
 - batches that fill no, one or several groups of the vectorised factorisation, and one sensor as
-  well as the most, give the numbers of the PyTorch form, with gradients;
+  well as the most, give the numbers of the PyTorch forms, with gradients;
+- the information form without an observation gives the prediction, and 0 likelihood exactly;
 - one covariance that cannot be factorised spoils its own row, no other;
 - a step without a gradient runs it too; under torch.func and with a gradient PyTorch runs;
 - without a compiler, with one that fails, or switched off: "auto" runs PyTorch and "native" says
@@ -17,7 +18,13 @@ import pytest
 import torch
 from filter_problems import Problem, assert_equal, assert_same
 
-from torchrl_drbpn.functional import compiled, filter_sequence, filter_step, native
+from torchrl_drbpn.functional import (
+    choose_form,
+    compiled,
+    filter_sequence,
+    filter_step,
+    native,
+)
 
 # A compiler that refuses the file is no reason to skip.
 pytestmark = pytest.mark.skipif(
@@ -43,6 +50,30 @@ def forgetful(monkeypatch, tmp_path):
 def test_every_size_equals_the_pytorch_form(batch, time, state, obs):
     problem = Problem(state, obs, batch=batch, time=time, hidden=(8, 5), activation="relu")
     assert_same(problem, problem.fast("native"), problem.fast("innovation"), 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("batch", "time", "state", "obs"),
+    [(1, 1, 1, 2), (4, 6, 2, 5), (17, 3, 5, 105), (3, 11, 17, 27), (33, 2, 8, 9), (2, 2, 64, 70)],
+)
+def test_every_size_of_the_information_form_equals_the_pytorch_form(batch, time, state, obs):
+    problem = Problem(
+        state, obs, batch=batch, time=time, hidden=(8, 5), activation="relu", restarts=time > 2
+    )
+    assert choose_form(problem.model()) == "information"
+    assert_same(problem, problem.fast("native"), problem.fast("information"), 1e-10)
+
+
+def test_where_nothing_was_observed_the_information_form_predicts_exactly():
+    problem = Problem(3, 7, time=1)
+    problem.observed = torch.zeros_like(problem.observed)
+    model, (start, action, *_, reset) = problem.model(), problem.arguments()
+    mean, _, ll = problem.fast("native")
+    moved = torch.where(reset, model.initial_mean, model.transition(start, action[:, 0]))
+    assert_equal(mean[:, 0], moved, 1e-14)
+    assert torch.equal(ll, torch.zeros_like(ll))
+    gradients = problem.gradients((ll,))
+    assert not any(gradient.any() for gradient in gradients.values())
 
 
 def test_a_covariance_that_cannot_be_factorised_spoils_its_own_row_alone():
@@ -112,8 +143,11 @@ def test_what_it_does_not_take_it_names():
     assert native.native_refusal(model, torch.zeros(2)) == "the dtypes differ"
     meta = torch.zeros(2, dtype=torch.float64, device="meta")
     assert native.native_refusal(model, meta) == "it runs on the CPU"
-    wide = Problem(2, 65).model()
-    assert native.native_refusal(wide) == "obs is 65, more than 64"
+    many_sensors = Problem(2, 65, full_noise=True).model()
+    assert native.native_refusal(many_sensors) == "obs is 65, more than 64"
+    assert native.native_refusal(Problem(2, 65).model()) is None  # 2 x 2 is factorised
+    large = Problem(65, 66).model()
+    assert native.native_refusal(large) == "state is 65, more than 64"
 
 
 @pytest.mark.parametrize(("n", "count"), [(1, 1), (3, 8), (17, 21), (64, 2)])

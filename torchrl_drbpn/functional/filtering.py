@@ -4,9 +4,10 @@ Four ways give the same numbers; :func:`filter_sequence` chooses:
 
 - *innovation form* (constant Q): factorises obs x obs, A = M (H Q H' + R) M' for every mask of the
   minibatch in one batched call; any R;
-- *native*: the innovation form in C (:mod:`.native`), where a C compiler is found, on the CPU;
 - *information form* (constant Q, diagonal R): factorises state x state,
   inv(cov) = inv(Q) + sum_i m_i / r_i h_i h_i'; the cheaper one where obs exceeds state;
+- *native*: the cheaper one of these two in C (:mod:`.native`), where a C compiler is found, on the
+  CPU;
 - *loop*: :mod:`.kalman` at every step, for any transition and for a Q that depends on the state.
 """
 
@@ -28,6 +29,7 @@ from torchrl_drbpn.functional.model import (
     Form,
     StateSpace,
     checked_form,
+    choose_form,
     constant_cov,
     initial_belief,
     predict_step,
@@ -226,8 +228,8 @@ def filter_sequence(
             ``restart_mean`` instead of from the sequence.
         restart_mean: shape ``(*batch, time, state)``; read where ``restart`` is True.
         return_cov: whether the filtered covariances are wanted.
-        form: "auto" chooses by dimension (:func:`choose_form`), and the C form of the innovation
-            form where it runs; "innovation", "native", "information" and "loop" force one.
+        form: "auto" chooses by dimension (:func:`choose_form`), in C where that runs;
+            "innovation", "information" (both in PyTorch), "native" (in C) and "loop" force one.
 
     Returns:
         :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
@@ -258,7 +260,7 @@ def filter_sequence(
     batch, time = reset.shape[:-1], reset.shape[-1]
     mean = mean.expand(*batch, mean.shape[-1])
 
-    if chosen == "native" or (chosen == "innovation" and form == "auto"):
+    if chosen == "native" or (chosen != "loop" and form == "auto"):
         refusal = native_refusal(model, mean, previous_action, observation, restart_mean)
         if refusal is None:
             filtered, ll = _native(
@@ -336,9 +338,14 @@ def _native(
 ) -> tuple[Tensor, Tensor]:
     f, dtype, (*batch, time) = model.transition, start.dtype, reset.shape
     assert isinstance(f, MeanNetwork)  # choose_form saw to it; for the type checker
-    # As in _for_innovation; here the whole filter is float64 then.
+    # As in _for_innovation and _information; here the whole filter is float64 then.
     obs, state = model.emission_matrix.shape
     wide = torch.float64 if obs > state else dtype
+    information = choose_form(model) == "information"
+    covs = constant_cov(model), model.initial_cov
+    if information:
+        prior, log_det = _prior_precision(model.double())
+        covs = prior[0], prior[1]
 
     def rows(x: Tensor | None) -> Tensor | None:
         return None if x is None else x.reshape(-1, *x.shape[len(batch) :]).contiguous()
@@ -348,17 +355,21 @@ def _native(
     )
     stored = None if stored is None else stored.to(wide)
     parameters = (
-        constant_cov(model), model.initial_cov, model.emission_cov, model.emission_matrix,
-        model.action_matrix, model.emission_offset, model.initial_mean,
+        *covs, model.emission_cov, model.emission_matrix, model.action_matrix,
+        model.emission_offset, model.initial_mean,
         *(p for pair in zip(f.weights, f.biases, strict=True) for p in pair),
     )  # fmt: skip
     mean, ll = NativeRecurrence.apply(  # type: ignore[no-untyped-call]
-        f.residual, f.activation,
+        information, f.residual, f.activation,
         *map(rows, (observation, observed, action, reset, restart, stored)),
         start if start.stride(-1) == 1 else start.contiguous(),
         *(x.to(wide).contiguous() for x in parameters),
     )  # fmt: skip
-    return mean.view(*batch, time, state).to(dtype), ll.view(*batch, time).to(dtype)
+    ll = ll.view(*batch, time)
+    if information:
+        ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
+        ll = torch.where(observed.any(-1), ll, 0.0)
+    return mean.view(*batch, time, state).to(dtype), ll.to(dtype)
 
 
 def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, list[Tensor]]:

@@ -1,6 +1,10 @@
-/* The belief filter over [batch, time] and its reverse pass as two functions: innovation form with
- * constant Q, eq. (8), (10), (12) [DRBPN]. The same sums as recurrence.py, where PyTorch needs some
- * hundred small operations a minibatch. native.py compiles this file, once for each `real`.
+/* The belief filter over [batch, time] and its reverse pass as two functions, for a constant Q, eq.
+ * (8), (10), (12) [DRBPN]. The same sums as recurrence.py, where PyTorch needs some hundred small
+ * operations a minibatch. compiled.py compiles this file, once for each `real`.
+ *
+ * Innovation and information form differ in how z = inv(S) (y - H m) and the gain of a row come
+ * about: by inv(S), obs x obs, or by C = inv(inv(P) + sum_i w_i h_i h_i'), state x state. The loops
+ * are the same: the mean moves by P H' z = C H' W (y - H m), and back.
  *
  * Inside, row r = t * batch + b is step t of sequence b, and every row of a matrix is padded with
  * zeros to whole vectors (capitals: N, S, J are obs, state, state + action, padded). What differs
@@ -18,6 +22,7 @@ typedef REAL real;
 #define BYTES 64
 #define LANES ((long)(BYTES / sizeof(real)))
 #define MAX_LAYERS 16
+#define BLOCK 4
 typedef real vec __attribute__((vector_size(BYTES), aligned(sizeof(real)), may_alias));
 #define LOG_2PI ((real)1.8378770664093453)
 #define INLINE static inline __attribute__((always_inline))
@@ -86,18 +91,22 @@ static void unpack(long rows, long cols, const real *from, long ld, real *to) {
 /* ---------------------------------------------------------------- sizes and memory */
 
 typedef struct {
-    long batch, time, obs, state, action, layers, residual, relu, full_noise, start_stride;
+    long batch, time, obs, state, action, layers, residual, relu, full_noise, start_stride,
+        information;
     long width[MAX_LAYERS + 1], W[MAX_LAYERS + 1]; /* of layer outputs; 0: (state, action) */
-    long N, S, J, rows, groups;
+    long N, S, J, rows, groups, half; /* half: entries of a lower triangle, state x state */
+    long entries;                     /* kept of an inverse */
 } Sizes;
 
 static Sizes read_sizes(const int64_t *d) {
-    Sizes z = {d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9]};
+    Sizes z = {d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9], d[10]};
     z.width[0] = z.state + z.action;
-    for (long i = 1; i <= z.layers; i++) z.width[i] = d[9 + i];
+    for (long i = 1; i <= z.layers; i++) z.width[i] = d[10 + i];
     for (long i = 0; i <= z.layers; i++) z.W[i] = padded(z.width[i]);
     z.N = padded(z.obs), z.S = padded(z.state), z.J = z.W[0];
     z.rows = z.batch * z.time, z.groups = (z.rows + LANES - 1) / LANES;
+    z.half = z.state * (z.state + 1) / 2;
+    z.entries = z.information ? z.half : z.obs * z.obs;
     return z;
 }
 
@@ -110,7 +119,7 @@ static real *take(Memory *m, long count) {
 }
 
 typedef struct { /* what the reverse pass reads, all but inverse as [rows][padded] */
-    real *input, *predicted, *hidden[MAX_LAYERS], *z, *inverse, *cross[2], *cross_t[2];
+    real *input, *predicted, *hidden[MAX_LAYERS], *z, *inverse, *cross[2], *cross_t[2], *shift;
 } Tape;
 
 static Tape lay_tape(const Sizes *s, Memory *m) {
@@ -118,8 +127,9 @@ static Tape lay_tape(const Sizes *s, Memory *m) {
     t.input = take(m, s->rows * s->J), t.predicted = take(m, s->rows * s->J);
     for (long i = 1; i < s->layers; i++) t.hidden[i] = take(m, s->rows * s->W[i]);
     t.z = take(m, s->rows * s->N);
-    t.inverse = take(m, s->groups * s->obs * s->obs * LANES);
-    for (int k = 0; k < 2; k++) {
+    t.inverse = take(m, s->groups * s->entries * LANES);
+    if (s->information) t.shift = take(m, s->rows * s->S);
+    else for (int k = 0; k < 2; k++) {
         t.cross[k] = take(m, s->state * s->N);
         t.cross_t[k] = take(m, s->obs * s->S);
     }
@@ -128,7 +138,9 @@ static Tape lay_tape(const Sizes *s, Memory *m) {
 
 typedef struct {
     real *weight_t[MAX_LAYERS + 1], *bias[MAX_LAYERS + 1], *sensor_t, *offset, *cov[2], *factor,
-        *lower, *error, *error_lanes, *log_det, *mean, *step;
+        *lower, *error, *error_lanes, *log_det, *mean, *step, *sensor, *inverse_noise, *log_noise,
+        *products, *weight, *gathered, *square, *pull, *fit;
+    const real *prior[2]; /* information form: inv(Q), inv(P_0) */
 } Ahead;
 
 static Ahead lay_ahead(const Sizes *s, Memory *m) {
@@ -138,18 +150,31 @@ static Ahead lay_ahead(const Sizes *s, Memory *m) {
         a.bias[i] = take(m, s->W[i]);
     }
     a.sensor_t = take(m, s->width[0] * s->N), a.offset = take(m, s->N);
-    a.cov[0] = take(m, s->obs * s->N), a.cov[1] = take(m, s->obs * s->N);
-    a.factor = take(m, s->obs * s->obs * LANES), a.lower = take(m, s->obs * s->obs * LANES);
-    a.error = take(m, s->batch * s->N), a.error_lanes = take(m, s->obs * LANES);
+    long n = s->information ? s->state : s->obs;
+    if (s->information) {
+        a.sensor = take(m, s->obs * s->S);
+        a.inverse_noise = take(m, s->obs), a.log_noise = take(m, s->obs);
+        a.products = take(m, s->half * s->obs), a.weight = take(m, s->obs * 2 * LANES);
+        a.gathered = take(m, s->half * 2 * LANES), a.square = take(m, n * n * LANES);
+        a.pull = take(m, s->batch * s->S), a.fit = take(m, s->batch * s->N);
+    } else a.cov[0] = take(m, s->obs * s->N), a.cov[1] = take(m, s->obs * s->N);
+    a.factor = take(m, n * n * LANES), a.lower = take(m, n * n * LANES);
+    a.error = take(m, s->batch * s->N), a.error_lanes = take(m, n * LANES);
     a.log_det = take(m, s->groups * LANES);
     a.mean = take(m, s->batch * s->S), a.step = take(m, s->batch * s->S);
     return a;
 }
 
+/* Of `spread` below: blocks of weights, one block of inverses, sums of half an inverse a sensor. */
+static long spread_size(const Sizes *s) {
+    long sensors = (s->obs + BLOCK - 1) / BLOCK * BLOCK;
+    return (sensors + BLOCK) * s->groups * LANES + s->obs * s->half;
+}
+
 typedef struct {
     real *weight[MAX_LAYERS + 1], *layer[MAX_LAYERS + 1], *sensor, *noise_prior[2], *filtered,
         *error, *left, *half, *lanes, *sum, *carry, *by_predicted, *by_input, *cross[2], *cov[2],
-        *square, *wide;
+        *square, *wide, *sensor_t, *inverse_noise, *gained, *prior[2], *outer, *spread;
 } Back;
 
 static Back lay_back(const Sizes *s, Memory *m) {
@@ -163,14 +188,22 @@ static Back lay_back(const Sizes *s, Memory *m) {
     b.sensor = take(m, s->obs * s->J);
     b.filtered = take(m, s->rows * s->S), b.error = take(m, s->rows * s->N);
     b.left = take(m, s->rows * s->N), b.half = take(m, s->groups * LANES);
-    b.lanes = take(m, s->obs * LANES), b.sum = take(m, s->obs * s->obs * LANES);
+    b.lanes = take(m, (s->information ? s->state : s->obs) * LANES);
+    b.sum = take(m, s->entries * LANES);
     b.carry = take(m, s->batch * s->S);
     b.by_predicted = take(m, s->batch * s->J), b.by_input = take(m, s->batch * s->J);
-    for (int k = 0; k < 2; k++) {
-        b.noise_prior[k] = take(m, s->state * s->S);
-        b.cross[k] = take(m, s->state * s->N), b.cov[k] = take(m, s->obs * s->N);
+    if (s->information) {
+        b.sensor_t = take(m, s->state * s->N), b.inverse_noise = take(m, s->obs);
+        b.gained = take(m, s->rows * s->S), b.outer = take(m, s->rows * s->S);
+        b.prior[0] = take(m, s->state * s->S), b.prior[1] = take(m, s->state * s->S);
+        b.spread = take(m, spread_size(s));
+    } else {
+        for (int k = 0; k < 2; k++) {
+            b.noise_prior[k] = take(m, s->state * s->S);
+            b.cross[k] = take(m, s->state * s->N), b.cov[k] = take(m, s->obs * s->N);
+        }
+        b.square = take(m, s->obs * s->N);
     }
-    b.square = take(m, s->obs * s->N);
     b.wide = take(m, widest * widest);
     return b;
 }
@@ -185,36 +218,72 @@ void sizes(const int64_t *dims, int64_t *out) {
 
 /* ---------------------------------------------------------------- the innovation covariances */
 
+/* Rows i .. i + many of column j of the factor. */
+INLINE void column(const int many, long n, long i, long j, vec *A, const vec *X) {
+    vec c[BLOCK];
+#pragma GCC unroll 4
+    for (int r = 0; r < many; r++) c[r] = A[(i + r) * n + j];
+    for (long k = 0; k < j; k++)
+#pragma GCC unroll 4
+        for (int r = 0; r < many; r++) c[r] -= A[(i + r) * n + k] * A[j * n + k];
+#pragma GCC unroll 4
+    for (int r = 0; r < many; r++) A[(i + r) * n + j] = c[r] * X[j * n + j];
+}
+
+/* Entries j .. j + many of row i of the factor's inverse; the rows above are there. */
+INLINE void inverse_row(const int many, long n, long i, long j, const vec *A, vec *X) {
+    vec c[BLOCK];
+#pragma GCC unroll 4
+    for (int r = 0; r < many; r++) c[r] = (vec){0};
+    for (long k = j; k < i; k++)
+#pragma GCC unroll 4
+        for (int r = 0; r < many; r++) c[r] -= A[i * n + k] * X[k * n + j + r];
+#pragma GCC unroll 4
+    for (int r = 0; r < many; r++) {
+        if (i > j + r) X[i * n + j + r] = c[r] * X[i * n + i];
+        if (i < j + r) X[i * n + j + r] = (vec){0};
+    }
+}
+
+/* Entries (i, j .. j + many) of X' X, and their mirror images. */
+INLINE void square(const int many, long n, long i, long j, const vec *X, vec *I) {
+    vec c[BLOCK];
+#pragma GCC unroll 4
+    for (int r = 0; r < many; r++) c[r] = (vec){0};
+    for (long k = i; k < n; k++)
+#pragma GCC unroll 4
+        for (int r = 0; r < many; r++) c[r] += X[k * n + i] * X[k * n + j + r];
+#pragma GCC unroll 4
+    for (int r = 0; r < many; r++) I[i * n + j + r] = I[(j + r) * n + i] = c[r];
+}
+
 /* I = inv(A), det = log|A| of LANES matrices; A holds lower triangles and becomes their factors. A
  * matrix that cannot be factorised becomes NaN alone. */
 static void invert_lanes(long n, vec *A, vec *X, vec *I, vec *det) {
     vec sum = {0};
-    for (long i = 0; i < n; i++)
-        for (long j = 0; j <= i; j++) {
-            vec c = A[i * n + j];
-            for (long k = 0; k < j; k++) c -= A[i * n + k] * A[j * n + k];
-            if (i > j) {
-                A[i * n + j] = c * X[j * n + j];
-                continue;
-            }
-            for (long l = 0; l < LANES; l++) c[l] = sizeof(real) == 4 ? sqrtf(c[l]) : sqrt(c[l]);
-            A[i * n + i] = c, X[i * n + i] = 1 / c;
-            for (long l = 0; l < LANES; l++)
-                sum[l] += 2 * (sizeof(real) == 4 ? logf(c[l]) : log(c[l]));
-        }
+    for (long j = 0; j < n; j++) { /* BLOCK sums at once: one alone would wait for itself */
+        vec c = A[j * n + j];
+        for (long k = 0; k < j; k++) c -= A[j * n + k] * A[j * n + k];
+        for (long l = 0; l < LANES; l++) c[l] = sizeof(real) == 4 ? sqrtf(c[l]) : sqrt(c[l]);
+        for (long l = 0; l < LANES; l++)
+            sum[l] += 2 * (sizeof(real) == 4 ? logf(c[l]) : log(c[l]));
+        A[j * n + j] = c, X[j * n + j] = 1 / c;
+        long i = j + 1;
+        for (; i + BLOCK <= n; i += BLOCK) column(BLOCK, n, i, j, A, X);
+        for (; i < n; i++) column(1, n, i, j, A, X);
+    }
     *det = sum;
-    for (long j = 0; j < n; j++) /* X = inv(factor) */
-        for (long i = j + 1; i < n; i++) {
-            vec c = {0};
-            for (long k = j; k < i; k++) c -= A[i * n + k] * X[k * n + j];
-            X[i * n + j] = c * X[i * n + i];
-        }
-    for (long i = 0; i < n; i++)
-        for (long j = 0; j <= i; j++) { /* X' X */
-            vec c = {0};
-            for (long k = i; k < n; k++) c += X[k * n + i] * X[k * n + j];
-            I[i * n + j] = I[j * n + i] = c;
-        }
+    for (long j = 0; j < n; j += BLOCK) { /* X = inv(factor), zero above its diagonal */
+        long wide = n - j < BLOCK ? n - j : BLOCK;
+        for (long i = j; i < n; i++)
+            if (wide == BLOCK) inverse_row(BLOCK, n, i, j, A, X);
+            else for (long k = j; k < n; k++) inverse_row(1, n, i, k, A, X);
+    }
+    for (long i = 0; i < n; i++) { /* X' X */
+        long j = 0;
+        for (; j + BLOCK <= i + 1; j += BLOCK) square(BLOCK, n, i, j, X, I);
+        for (; j <= i; j++) square(1, n, i, j, X, I);
+    }
 }
 
 /* The same for `count` whole matrices in rows, for the forms that are not in this file. */
@@ -261,30 +330,92 @@ static void invert(const Sizes *s, const Ahead *a, long group, const uint8_t *ob
         for (long j = 0; j < n; j++) I[i * n + j] *= mask[i] * mask[j];
 }
 
+/* C = inv(inv(P) + sum_i w_i h_i h_i') of two groups of LANES rows, w_i = observed_i / r_i. */
+static void gather(const Sizes *s, const Ahead *a, long group, const uint8_t *observed,
+                   const uint8_t *reset, real *inverse, real *log_det) {
+    long n = s->obs, m = s->state;
+    vec again[2] = {{0}}, *A = (vec *)a->factor, *I = (vec *)a->square;
+    for (long l = 0; l < 2 * LANES; l++) {
+        long r = group * LANES + l < s->rows ? group * LANES + l : s->rows - 1;
+        long from = (r % s->batch) * s->time + r / s->batch;
+        again[l / LANES][l % LANES] = reset[from];
+        for (long i = 0; i < n; i++)
+            a->weight[i * 2 * LANES + l] = observed[from * n + i] ? a->inverse_noise[i] : 0;
+    }
+    product(s->half, 2 * LANES, n, a->products, n, 1, a->weight, 2 * LANES, a->gathered, 2 * LANES,
+            1, 0);
+    for (long k = 0; k < 2 && group + k < s->groups; k++) {
+        const vec *sum = (const vec *)a->gathered + k;
+        vec *to = (vec *)inverse + (group + k) * s->half;
+        for (long i = 0; i < m; i++)
+            for (long j = 0; j <= i; j++, sum += 2) /* weights of exactly 0 or 1 choose exactly */
+                A[i * m + j] = *sum + (1 - again[k]) * a->prior[0][i * m + j]
+                               + again[k] * a->prior[1][i * m + j];
+        invert_lanes(m, A, (vec *)a->lower, I, (vec *)(log_det + (group + k) * LANES));
+        for (long i = 0; i < m; i++)
+            for (long j = 0; j <= i; j++) *to++ = I[i * m + j];
+    }
+}
+
 /* out[r] = inverse_r in[r] for the rows of one step; `in` starts at its first row. */
 static void solve(const Sizes *s, long t, const real *inverse, const real *in, real *lanes,
                   real *out) {
-    long n = s->obs, first = t * s->batch, last = first + s->batch;
+    long n = s->information ? s->state : s->obs, ld = s->information ? s->S : s->N;
+    long first = t * s->batch, last = first + s->batch;
     vec *e = (vec *)lanes;
     for (long group = first / LANES; group * LANES < last; group++) {
         long low = group * LANES > first ? group * LANES : first;
         long high = (group + 1) * LANES < last ? (group + 1) * LANES : last;
         if (high - low < LANES) memset(lanes, 0, n * BYTES);
         for (long r = low; r < high; r++)
-            for (long i = 0; i < n; i++) lanes[i * LANES + r % LANES] = in[(r - first) * s->N + i];
-        const vec *I = (const vec *)inverse + group * n * n;
+            for (long i = 0; i < n; i++) lanes[i * LANES + r % LANES] = in[(r - first) * ld + i];
+        const vec *I = (const vec *)inverse + group * s->entries;
         for (long i = 0; i < n; i++) {
             vec c = {0}, c2 = {0};
-            long j = 0;
-            for (; j + 1 < n; j += 2) c += I[i * n + j] * e[j], c2 += I[i * n + j + 1] * e[j + 1];
-            if (j < n) c += I[i * n + j] * e[j];
+            if (s->information) { /* a lower triangle, row after row */
+                const vec *row = I + i * (i + 1) / 2, *below = row + i;
+                for (long j = 0; j < i; j++) c += row[j] * e[j];
+                for (long j = i; j < n; below += ++j) c2 += *below * e[j];
+            } else {
+                long j = 0;
+                for (; j + 1 < n; j += 2)
+                    c += I[i * n + j] * e[j], c2 += I[i * n + j + 1] * e[j + 1];
+                if (j < n) c += I[i * n + j] * e[j];
+            }
             c += c2;
-            for (long r = low; r < high; r++) out[r * s->N + i] = c[r % LANES];
+            for (long r = low; r < high; r++) out[r * ld + i] = c[r % LANES];
         }
     }
 }
 
 /* ---------------------------------------------------------------- forward */
+
+/* One step from the predicted mean and the innovation e of each row, both in `a`: the mean moves by
+ * shift = C H' W e, what it leaves is e - H shift, and z = W (e - H shift) = inv(S) e. All are exact
+ * zeros where nothing was observed. Without log|P|. */
+static void gain_information(const Sizes *s, const Ahead *a, const Tape *tape, long t,
+                             const uint8_t *observed, real *mean, real *ll) {
+    long n = s->obs, m = s->state, N = s->N, S = s->S, batch = s->batch, row = t * batch;
+    real *z = tape->z + row * N, *shift = tape->shift + row * S;
+    for (long b = 0; b < batch; b++)
+        for (long i = 0; i < N; i++)
+            z[b * N + i] = i < n ? a->error[b * N + i] * a->inverse_noise[i] : 0;
+    product(batch, S, n, z, N, 1, a->sensor, S, a->pull, S, 1, 0);
+    solve(s, t, tape->inverse, a->pull, a->error_lanes, tape->shift);
+    product(batch, N, m, shift, S, 1, a->sensor_t, N, a->fit, N, 1, 0);
+    for (long b = 0; b < batch; b++) {
+        long at = b * s->time + t;
+        real *e = a->error + b * N, *moved = shift + b * S, sum = a->log_det[row + b];
+        for (long i = m; i < S; i++) moved[i] = 0;
+        for (long i = 0; i < n; i++) {
+            int seen = observed[at * n + i];
+            z[b * N + i] = seen ? (e[i] - a->fit[b * N + i]) * a->inverse_noise[i] : 0;
+            sum += z[b * N + i] * e[i] + (seen ? a->log_noise[i] : 0);
+        }
+        ll[at] = (real)-0.5 * sum;
+        for (long i = 0; i < m; i++) mean[at * m + i] = a->mean[b * S + i] += moved[i];
+    }
+}
 
 void forward(const int64_t *dims, void **p) {
     Sizes z = read_sizes(dims), *s = &z;
@@ -306,7 +437,18 @@ void forward(const int64_t *dims, void **p) {
     pack(m, n, H, 1, m, a.sensor_t, N);
     pack(s->action, n, B, 1, s->action, a.sensor_t + m * N, N);
     pack(1, n, d, 0, 1, a.offset, N);
-    for (int k = 0; k < 2; k++) { /* P H' and H P H' + R, P = Q or initial_cov */
+    if (s->information) {
+        real *to = a.products;
+        a.prior[0] = cov[0], a.prior[1] = cov[1]; /* the inverses, here */
+        pack(n, m, H, m, 1, a.sensor, S);
+        for (long i = 0; i < n; i++)
+            a.inverse_noise[i] = 1 / noise[i], a.log_noise[i] = log(noise[i]) + LOG_2PI;
+        for (long i = 0; i < m; i++)
+            for (long j = 0; j <= i; j++)
+                for (long k = 0; k < n; k++) *to++ = a.sensor_t[i * N + k] * a.sensor_t[j * N + k];
+        for (long g = 0; g < s->groups; g += 2)
+            gather(s, &a, g, observed, reset, tape.inverse, a.log_det);
+    } else for (int k = 0; k < 2; k++) { /* P H' and H P H' + R, P = Q or initial_cov */
         product(m, N, m, cov[k], m, 1, a.sensor_t, N, tape.cross[k], N, 1, 0);
         pack(n, m, tape.cross[k], 1, N, tape.cross_t[k], S);
         if (s->full_noise) pack(n, n, noise, n, 1, a.cov[k], N);
@@ -316,7 +458,7 @@ void forward(const int64_t *dims, void **p) {
         }
         product(n, N, m, H, m, 1, tape.cross[k], N, a.cov[k], N, 1, 1);
     }
-    for (long g = 0; g < s->groups; g++)
+    for (long g = 0; g < s->groups && !s->information; g++)
         invert(s, &a, g, observed, reset, tape.inverse + g * n * n * LANES, a.log_det + g * LANES);
 
     for (long t = 0; t < time; t++) {
@@ -360,6 +502,10 @@ void forward(const int64_t *dims, void **p) {
             for (long i = 0; i < n; i++) e[i] = observed[at + i] ? x[at + i] - e[i] : 0;
         }
         real *gained = tape.z + row * N;
+        if (s->information) {
+            gain_information(s, &a, &tape, t, observed, mean, ll);
+            continue;
+        }
         solve(s, t, tape.inverse, a.error, a.error_lanes, tape.z);
         /* a.mean holds the predicted mean: add P H' z, of the P that the row started from */
         for (long b = 0; b < batch; b++) {
@@ -392,6 +538,108 @@ static void add_outer(long rows, long cols, const real *left, const real *right,
         for (long j = 0; j < cols; j++) to[i * ld + j] += left[i] * right[j];
 }
 
+INLINE real over_lanes(vec v) {
+    real sum = 0;
+    for (long l = 0; l < LANES; l++) sum += v[l];
+    return sum;
+}
+
+/* By R and by inv(P), one row: what does not wait for the sums over all rows. */
+static void by_information(const Sizes *s, Back *w, const Tape *tape, long r,
+                           const uint8_t *observed, real half, int again, real *g_noise) {
+    long m = s->state, S = s->S;
+    const real *z = tape->z + r * s->N, *left = w->left + r * s->N, *shift = tape->shift + r * S;
+    real *p = w->gained + r * S, *outer = w->outer + r * S;
+    for (long i = 0; i < s->obs; i++)
+        g_noise[i] += z[i] * left[i] - (observed[i] ? half * w->inverse_noise[i] : 0);
+    for (long i = m; i < S; i++) p[i] = 0;
+    for (long i = 0; i < S; i++) outer[i] = -(p[i] + half * shift[i]);
+    if (!again) {
+        w->half[r] = half;
+        return;
+    }
+    const real *C = tape->inverse + r / LANES * s->half * LANES + r % LANES;
+    add_outer(m, m, outer, shift, w->prior[1], S);
+    for (long i = 0; i < m; i++)
+        for (long j = 0; j <= i; j++, C += LANES) {
+            w->prior[1][i * S + j] -= half * *C;
+            if (i > j) w->prior[1][j * S + i] -= half * *C;
+        }
+    memset(outer, 0, S * sizeof(real));
+}
+
+/* sum_t g_t w_ti C_t of every sensor i, lower triangles: [obs, rows] times [rows, state x state]. */
+static const real *spread(const Sizes *s, const Back *w, const Tape *tape, const real *g_ll,
+                          const uint8_t *observed) {
+    long n = s->obs, sensors = (n + BLOCK - 1) / BLOCK * BLOCK, groups = s->groups;
+    real *weight = w->spread, *block = weight + sensors * groups * LANES;
+    real *out = block + BLOCK * groups * LANES;
+    memset(weight, 0, sensors * groups * BYTES);
+    for (long r = 0; r < s->rows; r++) { /* [block of sensors][group][sensor][lane] */
+        long at = (r % s->batch) * s->time + r / s->batch;
+        for (long i = 0; i < n; i++)
+            if (observed[at * n + i])
+                weight[((i / BLOCK * groups + r / LANES) * BLOCK + i % BLOCK) * LANES + r % LANES] =
+                    g_ll[at] * w->inverse_noise[i];
+    }
+    for (long first = 0; first < s->half; first += BLOCK) {
+        long count = s->half - first < BLOCK ? s->half - first : BLOCK;
+        if (count < BLOCK) memset(block, 0, BLOCK * groups * BYTES);
+        for (long g = 0; g < groups; g++)
+            memcpy(block + g * BLOCK * LANES, tape->inverse + (g * s->half + first) * LANES,
+                   count * BYTES);
+        for (long from = 0; from < n; from += BLOCK) {
+            const vec *left = (const vec *)weight + from * groups, *right = (const vec *)block;
+            vec sum[BLOCK][BLOCK] = {{{0}}};
+            for (long g = 0; g < groups; g++, left += BLOCK, right += BLOCK)
+#pragma GCC unroll 4
+                for (int i = 0; i < BLOCK; i++)
+#pragma GCC unroll 4
+                    for (int j = 0; j < BLOCK; j++) sum[i][j] += left[i] * right[j];
+            for (long i = 0; i < BLOCK && from + i < n; i++)
+                for (long j = 0; j < count; j++)
+                    out[(from + i) * s->half + first + j] = over_lanes(sum[i][j]);
+        }
+    }
+    return out;
+}
+
+/* By H, R and the two inv(P), once every row is there; g_H and g_noise hold their first parts. */
+static void finish_information(const Sizes *s, Back *w, const Tape *tape, const real *H,
+                               const real *g_ll, const uint8_t *observed, real **g_prior,
+                               real *g_noise, real *g_H) {
+    long n = s->obs, m = s->state, N = s->N, S = s->S;
+    product(n, S, s->rows, tape->z, 1, N, w->gained, S, w->wide, S, 1, 0);
+    product(n, S, s->rows, w->error, 1, N, tape->shift, S, w->wide, S, -1, 1);
+    for (long i = 0; i < n; i++)
+        for (long j = 0; j < m; j++) g_H[i * m + j] += w->wide[i * S + j];
+    const real *by = g_ll ? spread(s, w, tape, g_ll, observed) : 0;
+    for (long i = 0; i < n && by; i++, by += s->half) {
+        const real *h = H + i * m, *at = by;
+        real square = 0;
+        for (long j = 0; j < m; j++)
+            for (long k = 0; k <= j; k++, at++) {
+                g_H[i * m + j] -= *at * h[k];
+                if (k < j) g_H[i * m + k] -= *at * h[j];
+                square += (k < j ? 2 : 1) * *at * h[j] * h[k];
+            }
+        g_noise[i] += (real)0.5 * square * w->inverse_noise[i];
+    }
+    product(m, S, s->rows, w->outer, 1, S, tape->shift, S, w->prior[0], S, 1, 0);
+    const vec *sum = (const vec *)w->sum;
+    for (long i = 0; i < m; i++)
+        for (long j = 0; j <= i; j++) {
+            real total = over_lanes(*sum++);
+            w->prior[0][i * S + j] -= total;
+            if (i > j) w->prior[0][j * S + i] -= total;
+        }
+    for (int k = 0; k < 2; k++)
+        for (long i = 0; i < m; i++)
+            for (long j = 0; j < m; j++)
+                g_prior[k][i * m + j] =
+                    (real)0.5 * (w->prior[k][i * S + j] + w->prior[k][j * S + i]);
+}
+
 void backward(const int64_t *dims, void **p) {
     Sizes z = read_sizes(dims), *s = &z;
     const real *g_mean = p[0], *g_ll = p[1], *cov[2] = {p[4], p[5]}, *H = p[6], *B = p[7];
@@ -400,25 +648,32 @@ void backward(const int64_t *dims, void **p) {
     real *g_x = p[10], *g_action = p[11], *g_stored = p[12], *g_start = p[13];
     real *g_cov[2] = {p[14], p[15]}, *g_noise = p[16], *g_H = p[17], *g_B = p[18], *g_d = p[19];
     real *g_initial = p[20];
+    const uint8_t *observed = p[21];
+    const real *noise = p[22];
     Tape tape = lay_tape(s, &kept);
     Back w = lay_back(s, &scratch);
     long n = s->obs, m = s->state, width = s->width[0], N = s->N, S = s->S, J = s->J;
     long batch = s->batch, time = s->time, last = s->layers;
 
     for (long i = 1; i <= last; i++)
-        pack(s->width[i], s->width[i - 1], p[20 + i], s->width[i - 1], 1, w.weight[i], s->W[i - 1]);
+        pack(s->width[i], s->width[i - 1], p[22 + i], s->width[i - 1], 1, w.weight[i], s->W[i - 1]);
     pack(n, m, H, m, 1, w.sensor, J);
     for (long i = 0; i < n; i++) {
         memcpy(w.sensor + i * J + m, B + i * s->action, s->action * sizeof(real));
         memset(w.sensor + i * J + width, 0, (J - width) * sizeof(real));
     }
-    for (int k = 0; k < 2; k++) {
+    if (s->information) {
+        pack(m, n, H, 1, m, w.sensor_t, N);
+        for (long i = 0; i < n; i++) w.inverse_noise[i] = 1 / noise[i];
+        memset(w.prior[1], 0, m * S * sizeof(real));
+        memset(g_noise, 0, n * sizeof(real));
+    } else for (int k = 0; k < 2; k++) {
         memset(w.cross[k], 0, m * N * sizeof(real));
         memset(w.cov[k], 0, n * N * sizeof(real));
     }
     memset(w.carry, 0, batch * S * sizeof(real));
     memset(w.half, 0, s->groups * BYTES);
-    memset(w.sum, 0, n * n * BYTES);
+    memset(w.sum, 0, s->entries * BYTES);
     memset(g_initial, 0, m * sizeof(real));
 
     for (long t = time - 1; t >= 0; t--) {
@@ -431,12 +686,21 @@ void backward(const int64_t *dims, void **p) {
                 g[b * S + i] = w.carry[b * S + i] + (outer && i < m ? outer[i] : 0);
         }
         /* ge, by the innovation: A^-1 (P H')' g through the gain, -g_ll z from the likelihood */
-        for (long b = 0; b < batch;) {
-            long first = b, k = reset[b * time + t] != 0;
-            while (b < batch && (reset[b * time + t] != 0) == k) b++;
-            product(b - first, N, m, g + first * S, S, 1, tape.cross[k], N, u + first * N, N, 1, 0);
+        if (s->information) { /* the same as W H C g */
+            solve(s, t, tape.inverse, g, w.lanes, w.gained);
+            product(batch, N, m, w.gained + row * S, S, 1, w.sensor_t, N, ge, N, 1, 0);
+            for (long b = 0; b < batch; b++)
+                for (long i = 0; i < n; i++)
+                    ge[b * N + i] *= observed[(b * time + t) * n + i] ? w.inverse_noise[i] : 0;
+        } else {
+            for (long b = 0; b < batch;) {
+                long first = b, k = reset[b * time + t] != 0;
+                while (b < batch && (reset[b * time + t] != 0) == k) b++;
+                product(b - first, N, m, g + first * S, S, 1, tape.cross[k], N, u + first * N, N, 1,
+                        0);
+            }
+            solve(s, t, tape.inverse, u, w.lanes, w.error);
         }
-        solve(s, t, tape.inverse, u, w.lanes, w.error);
         memset(w.by_predicted, 0, batch * J * sizeof(real));
         for (long b = 0; b < batch; b++) {
             long at = b * time + t, again = reset[at] != 0;
@@ -446,7 +710,9 @@ void backward(const int64_t *dims, void **p) {
             for (long i = 0; i < n; i++) e[i] -= by * zb[i];
             /* by A: (left z' + z left')/2 - half A^-1, summed over ordinary steps after the loop */
             for (long i = 0; i < N; i++) left[i] = -(e[i] + half * zb[i]);
-            if (again) {
+            if (s->information) {
+                by_information(s, &w, &tape, row + b, observed + at * n, half, again, g_noise);
+            } else if (again) {
                 const real *inverse = tape.inverse + (row + b) / LANES * n * n * LANES;
                 add_outer(n, n, left, zb, w.cov[1], N);
                 for (long i = 0; i < n * n; i++)
@@ -494,7 +760,7 @@ void backward(const int64_t *dims, void **p) {
 
     for (long i = 1; i <= last; i++) {
         const real *in = i == 1 ? tape.input : tape.hidden[i - 1];
-        real *by_weight = p[20 + last + 2 * i - 1], *by_bias = p[20 + last + 2 * i];
+        real *by_weight = p[22 + last + 2 * i - 1], *by_bias = p[22 + last + 2 * i];
         long wide = s->W[i - 1];
         product(s->width[i], wide, s->rows, w.layer[i], 1, s->W[i], in, wide, w.wide, wide, 1, 0);
         unpack(s->width[i], s->width[i - 1], w.wide, wide, by_weight);
@@ -510,14 +776,19 @@ void backward(const int64_t *dims, void **p) {
     for (long r = 0; r < s->rows; r++)
         for (long i = 0; i < n; i++) g_d[i] -= w.error[r * N + i];
 
-    product(m, N, s->rows, w.filtered, 1, S, tape.z, N, w.cross[0], N, 1, 0);
-    product(n, N, s->rows, w.left, 1, N, tape.z, N, w.cov[0], N, 1, 0);
     vec *sum = (vec *)w.sum;
     for (long g = 0; g < s->groups; g++) {
         vec half = *(vec *)(w.half + g * LANES);
-        const vec *I = (const vec *)tape.inverse + g * n * n;
-        for (long i = 0; i < n * n; i++) sum[i] += half * I[i];
+        const vec *I = (const vec *)tape.inverse + g * s->entries;
+        for (long i = 0; i < s->entries; i++) sum[i] += half * I[i];
     }
+    if (s->information) {
+        finish_information(s, &w, &tape, H, g_ll, observed, g_cov, g_noise, g_H);
+        return;
+    }
+
+    product(m, N, s->rows, w.filtered, 1, S, tape.z, N, w.cross[0], N, 1, 0);
+    product(n, N, s->rows, w.left, 1, N, tape.z, N, w.cov[0], N, 1, 0);
     for (long i = 0; i < n; i++)
         for (long j = 0; j < n; j++) {
             real total = 0;

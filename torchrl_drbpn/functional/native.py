@@ -1,9 +1,10 @@
-"""The innovation form in C: one call forward and one back, not some hundred operations each.
+"""The fast forms in C: one call forward and one back, not some hundred operations each.
 
 At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
 time between the operations of the filter, not in them. ``native.c`` holds the same sums as
-:class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and is held to the same oracles.
-:mod:`.compiled` compiles it; where it cannot, the PyTorch form runs.
+:class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and
+:class:`~torchrl_drbpn.functional.recurrence.InformationRecurrence` and is held to the same oracles.
+:mod:`.compiled` compiles it; where it cannot, the PyTorch forms run.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchrl_drbpn.functional.compiled import load_library, native_error
-from torchrl_drbpn.functional.model import StateSpace
+from torchrl_drbpn.functional.model import StateSpace, choose_form
 from torchrl_drbpn.functional.recurrence import MeanNetwork
 
 __all__ = ["NativeRecurrence", "native_refusal"]
 
 _CPU = torch.device("cpu")
-_MAX_OBS = 64  # the batched factorisation keeps a group of matrices in cache up to here
+_MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
 _MAX_LAYERS = 15
 
 
@@ -30,7 +31,7 @@ def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
     """Say why the C form does not take this model and these inputs.
 
     Args:
-        model: a model that the innovation form takes.
+        model: a model that the innovation or the information form takes.
         tensors: the inputs of the filter that hold numbers.
 
     Returns:
@@ -46,7 +47,7 @@ def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
         'the dtypes differ'
     """
     dtype = model.initial_mean.dtype
-    obs = len(model.emission_matrix)
+    obs, state = model.emission_matrix.shape
     assert isinstance(model.transition, MeanNetwork)  # as the innovation form demands
     every = [*model.transition.weights, *model.transition.biases, *model[1:], *tensors]
     given = [x for x in every if isinstance(x, Tensor)]
@@ -58,8 +59,9 @@ def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
         return "it runs on the CPU"
     if {x.dtype for x in given} != {dtype}:
         return "the dtypes differ"
-    if obs > _MAX_OBS:
-        return f"obs is {obs}, more than {_MAX_OBS}"
+    size = state if choose_form(model) == "information" else obs
+    if size > _MAX_SIZE:
+        return f"{'obs' if size == obs else 'state'} is {size}, more than {_MAX_SIZE}"
     if len(model.transition.weights) > _MAX_LAYERS:
         return f"the transition has more than {_MAX_LAYERS} layers"
     return native_error(dtype)
@@ -73,21 +75,23 @@ def _call(function: Any, dims: Any, tensors: list[Tensor | None]) -> None:
 class NativeRecurrence(torch.autograd.Function):
     """Filter mean and log-likelihood of whole sequences by ``native.c``, batch first.
 
-    Inputs: residual, activation, observation, observed, previous action, reset, restart, stored
-    mean, start, Q, initial covariance, R, H, B, d, initial mean, then the weight and the bias of
-    each layer. All contiguous, one dtype, on the CPU.
+    Inputs: whether it is the information form, residual, activation, observation, observed,
+    previous action, reset, restart, stored mean, start, Q, initial covariance, R, H, B, d, initial
+    mean, then the weight and the bias of each layer. All contiguous, one dtype, on the CPU. The
+    information form takes the inverses of Q and of the initial covariance in their places, leaves
+    their log-determinant out of the likelihood, and takes nothing observed for no special case.
     """
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor]:
         """Return filtered mean ``(batch, time, state)`` and log-likelihood ``(batch, time)``."""
-        residual, activation, x, observed, action, reset, restart, stored, start = args[:9]
-        Q, initial_cov, R, H, B, d, initial_mean, *layers = args[9:]
+        (information, residual, activation, x, observed, action, reset, restart, stored) = args[:9]
+        start, Q, initial_cov, R, H, B, d, initial_mean, *layers = args[9:]
         (batch, time, obs), state = x.shape, start.shape[-1]
         widths = [weight.shape[0] for weight in layers[0::2]]
         numbers = [
             batch, time, obs, state, action.shape[-1], len(widths), residual, activation == "relu",
-            R.ndim == 2, start.stride(0), *widths,
+            R.ndim == 2, start.stride(0), information, *widths,
         ]  # fmt: skip
         dims = (ctypes.c_int64 * len(numbers))(*numbers)
         library = load_library(x.dtype)
@@ -103,7 +107,7 @@ class NativeRecurrence(torch.autograd.Function):
                 initial_mean, mean, ll, tape, scratch, *layers,
             ],
         )  # fmt: skip
-        ctx.save_for_backward(reset, restart, Q, initial_cov, R, H, B, d, tape, *layers)
+        ctx.save_for_backward(observed, reset, restart, Q, initial_cov, R, H, B, d, tape, *layers)
         ctx.dims, ctx.shape, ctx.scratch = dims, (batch, time, obs, state), counts[2]
         ctx.set_materialize_grads(False)
         return mean, ll
@@ -112,13 +116,13 @@ class NativeRecurrence(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g_mean: Tensor | None, g_ll: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return the gradient of every input of ``forward``, in its order."""
-        reset, restart, Q, initial_cov, R, H, B, d, tape, *layers = ctx.saved_tensors
+        observed, reset, restart, Q, initial_cov, R, H, B, d, tape, *layers = ctx.saved_tensors
         batch, time, obs, state = ctx.shape
         wanted = ctx.needs_input_grad
-        g_x = tape.new_empty(batch, time, obs) if wanted[2] else None
-        g_action = tape.new_empty(batch, time, B.shape[-1]) if wanted[4] else None
-        g_stored = tape.new_empty(batch, time, state) if wanted[7] else None
-        g_start = tape.new_empty(batch, state) if wanted[8] else None
+        g_x = tape.new_empty(batch, time, obs) if wanted[3] else None
+        g_action = tape.new_empty(batch, time, B.shape[-1]) if wanted[5] else None
+        g_stored = tape.new_empty(batch, time, state) if wanted[8] else None
+        g_start = tape.new_empty(batch, state) if wanted[9] else None
         of_model = [torch.empty_like(v) for v in (Q, initial_cov, R, H, B, d)]
         g_initial = tape.new_empty(state)
         of_layers = [torch.empty_like(v) for v in layers]
@@ -129,10 +133,11 @@ class NativeRecurrence(torch.autograd.Function):
                 None if g_mean is None else g_mean.contiguous(),
                 None if g_ll is None else g_ll.contiguous(),
                 reset, restart, Q, initial_cov, H, B, tape, tape.new_empty(ctx.scratch),
-                g_x, g_action, g_stored, g_start, *of_model, g_initial, *layers[0::2], *of_layers,
+                g_x, g_action, g_stored, g_start, *of_model, g_initial, observed,
+                R, *layers[0::2], *of_layers,
             ],
         )  # fmt: skip
         return (
-            None, None, g_x, None, g_action, None, None, g_stored, g_start, *of_model, g_initial,
-            *of_layers,
+            None, None, None, g_x, None, g_action, None, None, g_stored, g_start, *of_model,
+            g_initial, *of_layers,
         )  # fmt: skip
