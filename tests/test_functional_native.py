@@ -91,8 +91,9 @@ def test_a_covariance_that_cannot_be_factorised_spoils_its_own_row_alone():
     assert torch.equal(out.mean[2, :3], expected.mean[2, :3])
 
 
-def test_a_step_is_a_sequence_of_one_and_differentiable_as_often_as_wanted():
-    problem = Problem(4, 4, batch=6, time=1)
+@pytest.mark.parametrize("obs", [4, 9], ids=["innovation", "information"])
+def test_a_step_is_a_sequence_of_one_and_differentiable_as_often_as_wanted(obs):
+    problem = Problem(4, obs, batch=6, time=1)
     model, (start, action, x, seen, reset) = problem.model(), problem.arguments()
     arguments = (start, action[:, 0], x[:, 0], seen[:, 0], reset[:, 0])
     slow = filter_step(model, *arguments)

@@ -110,7 +110,7 @@ def filter_step(
     check_observed(observation, observed)
     chosen = checked_form(model, form)
     if (
-        chosen == "innovation"
+        chosen != "loop"
         and form == "auto"
         and not torch.is_grad_enabled()  # with a gradient, one that can be differentiated again
         and native_refusal(model, mean, previous_action, observation) is None
