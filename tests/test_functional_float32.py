@@ -10,9 +10,7 @@ import torch
 from filter_problems import FAST, SIZES, Problem
 from torch import Tensor
 
-from torchrl_drbpn.functional import (
-    filter_step,
-)
+from torchrl_drbpn.functional import filter_step, native_error
 
 
 @pytest.mark.parametrize("form", [*FAST, "loop"])
@@ -86,6 +84,17 @@ def test_float32_keeps_its_digits_at_the_noise_floor(state, obs, full_noise):
     for name, gradient in found.items():
         error = (gradient.double() - expected[name]).norm() / expected[name].norm()
         assert float(error) < 1e-3, name
+
+
+@pytest.mark.skipif(native_error(torch.float64) is not None, reason="no C compiler here")
+def test_float64_in_c_keeps_its_digits_at_the_noise_floor():
+    _, problem = at_the_noise_floor(16, 105)
+    outputs, truth = problem.fast("native"), problem.fast("loop")
+    found, expected = (problem.gradients((out[0], out[2])) for out in (outputs, truth))
+    assert float((outputs[2] - truth[2]).detach().abs().max()) < 1e-8
+    for name, gradient in found.items():
+        error = (gradient - expected[name]).norm() / expected[name].norm()
+        assert float(error) < 3e-9, name
 
 
 @pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])

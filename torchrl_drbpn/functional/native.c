@@ -139,8 +139,7 @@ static Tape lay_tape(const Sizes *s, Memory *m) {
 typedef struct {
     real *weight_t[MAX_LAYERS + 1], *bias[MAX_LAYERS + 1], *sensor_t, *offset, *cov[2], *factor,
         *lower, *error, *error_lanes, *log_det, *mean, *step, *sensor, *inverse_noise, *log_noise,
-        *products, *weight, *gathered, *square, *pull, *fit;
-    const real *prior[2]; /* information form: inv(Q), inv(P_0) */
+        *products, *weight, *gathered, *square, *pull, *fit, *prior[2];
 } Ahead;
 
 static Ahead lay_ahead(const Sizes *s, Memory *m) {
@@ -157,6 +156,7 @@ static Ahead lay_ahead(const Sizes *s, Memory *m) {
         a.products = take(m, s->half * s->obs), a.weight = take(m, s->obs * 2 * LANES);
         a.gathered = take(m, s->half * 2 * LANES), a.square = take(m, n * n * LANES);
         a.pull = take(m, s->batch * s->S), a.fit = take(m, s->batch * s->N);
+        a.prior[0] = take(m, n * s->S), a.prior[1] = take(m, n * s->S);
     } else a.cov[0] = take(m, s->obs * s->N), a.cov[1] = take(m, s->obs * s->N);
     a.factor = take(m, n * n * LANES), a.lower = take(m, n * n * LANES);
     a.error = take(m, s->batch * s->N), a.error_lanes = take(m, n * LANES);
@@ -174,7 +174,8 @@ static long spread_size(const Sizes *s) {
 typedef struct {
     real *weight[MAX_LAYERS + 1], *layer[MAX_LAYERS + 1], *sensor, *noise_prior[2], *filtered,
         *error, *left, *half, *lanes, *sum, *carry, *by_predicted, *by_input, *cross[2], *cov[2],
-        *square, *wide, *sensor_t, *inverse_noise, *gained, *prior[2], *outer, *spread;
+        *square, *wide, *sensor_t, *inverse_noise, *gained, *prior[2],
+        *by_prior[2], *outer, *pull, *step, *spread;
 } Back;
 
 static Back lay_back(const Sizes *s, Memory *m) {
@@ -195,7 +196,10 @@ static Back lay_back(const Sizes *s, Memory *m) {
     if (s->information) {
         b.sensor_t = take(m, s->state * s->N), b.inverse_noise = take(m, s->obs);
         b.gained = take(m, s->rows * s->S), b.outer = take(m, s->rows * s->S);
-        b.prior[0] = take(m, s->state * s->S), b.prior[1] = take(m, s->state * s->S);
+        for (int k = 0; k < 2; k++) {
+            b.prior[k] = take(m, s->state * s->S), b.by_prior[k] = take(m, s->state * s->S);
+        }
+        b.pull = take(m, s->batch * s->S), b.step = take(m, s->batch * s->S);
         b.spread = take(m, spread_size(s));
     } else {
         for (int k = 0; k < 2; k++) {
@@ -349,8 +353,8 @@ static void gather(const Sizes *s, const Ahead *a, long group, const uint8_t *ob
         vec *to = (vec *)inverse + (group + k) * s->half;
         for (long i = 0; i < m; i++)
             for (long j = 0; j <= i; j++, sum += 2) /* weights of exactly 0 or 1 choose exactly */
-                A[i * m + j] = *sum + (1 - again[k]) * a->prior[0][i * m + j]
-                               + again[k] * a->prior[1][i * m + j];
+                A[i * m + j] = *sum + (1 - again[k]) * a->prior[0][i * s->S + j]
+                               + again[k] * a->prior[1][i * s->S + j];
         invert_lanes(m, A, (vec *)a->lower, I, (vec *)(log_det + (group + k) * LANES));
         for (long i = 0; i < m; i++)
             for (long j = 0; j <= i; j++) *to++ = I[i * m + j];
@@ -392,9 +396,10 @@ static void solve(const Sizes *s, long t, const real *inverse, const real *in, r
 
 /* One step from the predicted mean and the innovation e of each row, both in `a`: the mean moves by
  * shift = C H' W e, what it leaves is e - H shift, and z = W (e - H shift) = inv(S) e. All are exact
- * zeros where nothing was observed. Without log|P|. */
+ * zeros where nothing was observed. Without log|P|. e' z as a sum of squares: shift is where it is
+ * least, so an error of shift counts by its square alone. */
 static void gain_information(const Sizes *s, const Ahead *a, const Tape *tape, long t,
-                             const uint8_t *observed, real *mean, real *ll) {
+                             const uint8_t *observed, const uint8_t *reset, real *mean, real *ll) {
     long n = s->obs, m = s->state, N = s->N, S = s->S, batch = s->batch, row = t * batch;
     real *z = tape->z + row * N, *shift = tape->shift + row * S;
     for (long b = 0; b < batch; b++)
@@ -403,15 +408,23 @@ static void gain_information(const Sizes *s, const Ahead *a, const Tape *tape, l
     product(batch, S, n, z, N, 1, a->sensor, S, a->pull, S, 1, 0);
     solve(s, t, tape->inverse, a->pull, a->error_lanes, tape->shift);
     product(batch, N, m, shift, S, 1, a->sensor_t, N, a->fit, N, 1, 0);
+    for (long b = 0; b < batch;) {
+        long first = b, k = reset[b * s->time + t] != 0;
+        while (b < batch && (reset[b * s->time + t] != 0) == k) b++;
+        product(b - first, S, m, shift + first * S, S, 1, a->prior[k], S, a->pull + first * S, S, 1,
+                0);
+    }
     for (long b = 0; b < batch; b++) {
         long at = b * s->time + t;
         real *e = a->error + b * N, *moved = shift + b * S, sum = a->log_det[row + b];
         for (long i = m; i < S; i++) moved[i] = 0;
         for (long i = 0; i < n; i++) {
             int seen = observed[at * n + i];
-            z[b * N + i] = seen ? (e[i] - a->fit[b * N + i]) * a->inverse_noise[i] : 0;
-            sum += z[b * N + i] * e[i] + (seen ? a->log_noise[i] : 0);
+            real left = seen ? e[i] - a->fit[b * N + i] : 0;
+            z[b * N + i] = left * a->inverse_noise[i];
+            sum += z[b * N + i] * left + (seen ? a->log_noise[i] : 0);
         }
+        for (long i = 0; i < m; i++) sum += moved[i] * a->pull[b * S + i];
         ll[at] = (real)-0.5 * sum;
         for (long i = 0; i < m; i++) mean[at * m + i] = a->mean[b * S + i] += moved[i];
     }
@@ -439,7 +452,7 @@ void forward(const int64_t *dims, void **p) {
     pack(1, n, d, 0, 1, a.offset, N);
     if (s->information) {
         real *to = a.products;
-        a.prior[0] = cov[0], a.prior[1] = cov[1]; /* the inverses, here */
+        for (int k = 0; k < 2; k++) pack(m, m, cov[k], m, 1, a.prior[k], S); /* inverses, here */
         pack(n, m, H, m, 1, a.sensor, S);
         for (long i = 0; i < n; i++)
             a.inverse_noise[i] = 1 / noise[i], a.log_noise[i] = log(noise[i]) + LOG_2PI;
@@ -503,7 +516,7 @@ void forward(const int64_t *dims, void **p) {
         }
         real *gained = tape.z + row * N;
         if (s->information) {
-            gain_information(s, &a, &tape, t, observed, mean, ll);
+            gain_information(s, &a, &tape, t, observed, reset, mean, ll);
             continue;
         }
         solve(s, t, tape.inverse, a.error, a.error_lanes, tape.z);
@@ -559,13 +572,32 @@ static void by_information(const Sizes *s, Back *w, const Tape *tape, long r,
         return;
     }
     const real *C = tape->inverse + r / LANES * s->half * LANES + r % LANES;
-    add_outer(m, m, outer, shift, w->prior[1], S);
+    add_outer(m, m, outer, shift, w->by_prior[1], S);
     for (long i = 0; i < m; i++)
         for (long j = 0; j <= i; j++, C += LANES) {
-            w->prior[1][i * S + j] -= half * *C;
-            if (i > j) w->prior[1][j * S + i] -= half * *C;
+            w->by_prior[1][i * S + j] -= half * *C;
+            if (i > j) w->by_prior[1][j * S + i] -= half * *C;
         }
     memset(outer, 0, S * sizeof(real));
+}
+
+/* By the predicted mean: inv(P) (p + g_ll shift), the same as g - H' e of the innovation form but
+ * without its difference of large numbers where R is small. */
+static void predicted_information(const Sizes *s, const Back *w, const Tape *tape, long t,
+                                  const uint8_t *reset, const real *g_ll) {
+    long m = s->state, S = s->S, batch = s->batch;
+    const real *p = w->gained + t * batch * S, *shift = tape->shift + t * batch * S;
+    real *sum = w->step, *to = w->pull;
+    for (long b = 0; b < batch; b++)
+        for (long i = 0; i < m; i++)
+            sum[b * S + i] = p[b * S + i] + (g_ll ? g_ll[b * s->time + t] : 0) * shift[b * S + i];
+    for (long b = 0; b < batch;) {
+        long first = b, k = reset[b * s->time + t] != 0;
+        while (b < batch && (reset[b * s->time + t] != 0) == k) b++;
+        product(b - first, S, m, sum + first * S, S, 1, w->prior[k], S, to + first * S, S, 1, 0);
+    }
+    for (long b = 0; b < batch; b++)
+        memcpy(w->by_predicted + b * s->J, to + b * S, m * sizeof(real));
 }
 
 /* sum_t g_t w_ti C_t of every sensor i, lower triangles: [obs, rows] times [rows, state x state]. */
@@ -625,19 +657,19 @@ static void finish_information(const Sizes *s, Back *w, const Tape *tape, const 
             }
         g_noise[i] += (real)0.5 * square * w->inverse_noise[i];
     }
-    product(m, S, s->rows, w->outer, 1, S, tape->shift, S, w->prior[0], S, 1, 0);
+    product(m, S, s->rows, w->outer, 1, S, tape->shift, S, w->by_prior[0], S, 1, 0);
     const vec *sum = (const vec *)w->sum;
     for (long i = 0; i < m; i++)
         for (long j = 0; j <= i; j++) {
             real total = over_lanes(*sum++);
-            w->prior[0][i * S + j] -= total;
-            if (i > j) w->prior[0][j * S + i] -= total;
+            w->by_prior[0][i * S + j] -= total;
+            if (i > j) w->by_prior[0][j * S + i] -= total;
         }
     for (int k = 0; k < 2; k++)
         for (long i = 0; i < m; i++)
             for (long j = 0; j < m; j++)
                 g_prior[k][i * m + j] =
-                    (real)0.5 * (w->prior[k][i * S + j] + w->prior[k][j * S + i]);
+                    (real)0.5 * (w->by_prior[k][i * S + j] + w->by_prior[k][j * S + i]);
 }
 
 void backward(const int64_t *dims, void **p) {
@@ -665,7 +697,8 @@ void backward(const int64_t *dims, void **p) {
     if (s->information) {
         pack(m, n, H, 1, m, w.sensor_t, N);
         for (long i = 0; i < n; i++) w.inverse_noise[i] = 1 / noise[i];
-        memset(w.prior[1], 0, m * S * sizeof(real));
+        for (int k = 0; k < 2; k++) pack(m, m, cov[k], m, 1, w.prior[k], S); /* inverses, here */
+        memset(w.by_prior[1], 0, m * S * sizeof(real));
         memset(g_noise, 0, n * sizeof(real));
     } else for (int k = 0; k < 2; k++) {
         memset(w.cross[k], 0, m * N * sizeof(real));
@@ -725,7 +758,9 @@ void backward(const int64_t *dims, void **p) {
             memcpy(w.by_predicted + b * J, g + b * S, m * sizeof(real));
             if (again) memset(g + b * S, 0, S * sizeof(real));
         }
-        product(batch, J, n, ge, N, 1, w.sensor, J, w.by_predicted, J, -1, 1);
+        long from = s->information ? m / LANES * LANES : 0; /* it needs the action's columns only */
+        product(batch, J - from, n, ge, N, 1, w.sensor + from, J, w.by_predicted + from, J, -1, 1);
+        if (s->information) predicted_information(s, &w, &tape, t, reset, g_ll);
         for (long b = 0; b < batch; b++) {
             real *by = w.by_predicted + b * J;
             int again = reset[b * time + t] != 0;
