@@ -1,4 +1,4 @@
-"""The filter's C code: compiled once for a machine, when it is first used.
+"""The C code of the package: compiled once for a machine, when it is first used.
 
 The C compiler is the one named in ``CC`` or found on the path; the library goes into the user's
 cache folder (``XDG_CACHE_HOME``, else ``~/.cache``), under a name that holds its source, the
@@ -24,13 +24,16 @@ from torch import Tensor
 
 __all__ = ["NativeError", "load_library", "native_error", "spd_inverse"]
 
-_SOURCE = Path(__file__).with_name("native.c")
+# native.c is the filter, moments.c the running statistics.
+_FOLDER = Path(__file__).parent
 _MAX_SIZE = 64  # a group of matrices stays in cache up to here
 _REALS = {torch.float32: "float", torch.float64: "double"}
 # Vectors of the width that PyTorch found: the compiled file then runs wherever its name is equal.
 _MACHINE_FLAGS = {"AVX512": ["-march=x86-64-v4"], "AVX2": ["-march=x86-64-v3"]}
 # Without errno and traps roots and choices become vector instructions; sums keep their order.
 _FLAGS = ["-O3", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
+# moments.c gives the bits of PyTorch's operations, each of which is rounded by itself.
+_OWN_FLAGS = {"moments": ["-ffp-contract=off"]}
 
 
 class NativeError(RuntimeError):
@@ -38,11 +41,12 @@ class NativeError(RuntimeError):
 
 
 @functools.cache
-def load_library(dtype: torch.dtype) -> ctypes.CDLL:
-    """Load ``native.c``, compiled for a dtype; compile it where that is still to do.
+def load_library(dtype: torch.dtype, source: str = "native") -> ctypes.CDLL:
+    """Load a C file of this folder, compiled for a dtype; compile it where that is still to do.
 
     Args:
         dtype: ``torch.float32`` or ``torch.float64``.
+        source: ``"native"`` or ``"moments"``.
 
     Returns:
         Its functions.
@@ -62,9 +66,10 @@ def load_library(dtype: torch.dtype) -> ctypes.CDLL:
     if not compiler[0] or shutil.which(compiler[0]) is None:
         raise NativeError("there is no C compiler: install gcc or clang, or name one in CC")
     flags = [*_FLAGS, *_MACHINE_FLAGS.get(torch.backends.cpu.get_cpu_capability(), [])]
-    command = [*compiler, *flags, f"-DREAL={_REALS[dtype]}"]
-    text = "\n".join([*command, platform.machine(), _SOURCE.read_text(encoding="utf-8")])
-    name = f"native-{_REALS[dtype]}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.so"
+    command = [*compiler, *flags, *_OWN_FLAGS.get(source, []), f"-DREAL={_REALS[dtype]}"]
+    file = _FOLDER / f"{source}.c"
+    text = "\n".join([*command, platform.machine(), file.read_text(encoding="utf-8")])
+    name = f"{source}-{_REALS[dtype]}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.so"
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     path = Path(cache) / "torchrl_drbpn" / name
     try:
@@ -73,14 +78,14 @@ def load_library(dtype: torch.dtype) -> ctypes.CDLL:
             with tempfile.TemporaryDirectory(dir=path.parent) as folder:
                 built = Path(folder) / name
                 done = subprocess.run(
-                    [*command, "-o", str(built), str(_SOURCE), "-lm"],
+                    [*command, "-o", str(built), str(file), "-lm"],
                     capture_output=True,
                     text=True,
                     check=False,
                 )
                 if done.returncode:
                     reason = " ".join(done.stderr.split())[:300]
-                    raise NativeError(f"`{compiler[0]}` refused native.c: {reason}")
+                    raise NativeError(f"`{compiler[0]}` refused {file.name}: {reason}")
                 built.replace(path)  # whole or not at all, whoever else compiles it now
         return ctypes.CDLL(str(path))
     except OSError as error:
@@ -88,11 +93,12 @@ def load_library(dtype: torch.dtype) -> ctypes.CDLL:
 
 
 @functools.cache
-def native_error(dtype: torch.dtype = torch.float32) -> str | None:
+def native_error(dtype: torch.dtype = torch.float32, source: str = "native") -> str | None:
     """Say why the C form cannot be had on this machine; compiles it where that is still to do.
 
     Args:
         dtype: of the filter's tensors.
+        source: ``"native"`` for the filter, ``"moments"`` for the running statistics.
 
     Returns:
         None where it can be had, else the reason.
@@ -104,7 +110,7 @@ def native_error(dtype: torch.dtype = torch.float32) -> str | None:
     if dtype not in _REALS:
         return f"there is no C form for {dtype}"
     try:
-        load_library(dtype)
+        load_library(dtype, source)
     except NativeError as error:
         return str(error)
     return None

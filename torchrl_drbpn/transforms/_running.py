@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform
 
+from torchrl_drbpn.functional.running import learn_native, scale_native, takes_native
 from torchrl_drbpn.functional.statistics import Moments, masked_moments, variance
 from torchrl_drbpn.transforms._common import OrderedTransform
 
@@ -65,12 +66,15 @@ class RunningMoments(nn.Module):
             zero = torch.zeros(event_shape, dtype=torch.float64, device=device)
             self._store(Moments(zero, zero.clone(), zero.clone()))
 
-    def learn(self, value: Tensor, observed: Tensor | None) -> bool:
+    def learn(
+        self, value: Tensor, observed: Tensor | None, rows: Tensor | None = None
+    ) -> bool:
         """Merge the observed entries of a batch into the statistics.
 
         Args:
             value: shape `(*batch, *event)`, floating point.
             observed: shape `(*batch, *event)`, bool; None counts every entry.
+            rows: shape `(*batch,)`, bool; None counts every row.
 
         Returns:
             False where an observed entry is NaN or infinite; nothing was learned then.
@@ -79,6 +83,17 @@ class RunningMoments(nn.Module):
         count = cast(Tensor, buffers["count"])
         # A differentiable environment must not be remembered for ever.
         value = value.detach()
+        if takes_native(value, observed) and (rows is None or rows.is_contiguous()):
+            before = Moments(count, cast(Tensor, buffers["mean"]), cast(Tensor, buffers["m2"]))
+            after = learn_native(before, value, observed, rows, self.eps)
+            if after is None:
+                return False
+            buffers["count"], buffers["mean"], buffers["m2"] = after.moments
+            buffers["inverse_scale"] = after.inverse_scale
+            return True
+        if rows is not None:
+            spread = rows.reshape(*rows.shape, *(1,) * count.ndim).expand_as(value)
+            observed = spread if observed is None else observed & spread
         if value.ndim != count.ndim + 1:
             shape = (-1, *count.shape)
             value = value.reshape(shape)
@@ -105,6 +120,36 @@ class RunningMoments(nn.Module):
         m2 = batch.m2.add_(cast(Tensor, buffers["m2"])).addcmul_(delta.mul_(count), shift)
         self._store(Moments(total, shift.add_(cast(Tensor, buffers["mean"])), m2))
         return True
+
+    def scale(
+        self,
+        value: Tensor,
+        observed: Tensor | None,
+        *,
+        clip: float | None,
+        centred: bool = True,
+    ) -> Tensor:
+        """Return clip((value - mean) / sqrt(var + eps), -clip, clip).
+
+        Args:
+            value: shape `(*batch, *event)`, floating point.
+            observed: shape `(*batch, *event)`, bool: 0 where it is False; None: no such entry.
+            clip: largest magnitude; None for no limit.
+            centred: whether the mean is subtracted.
+
+        Returns:
+            Shape and dtype of `value`.
+        """
+        mean = cast(Tensor, self._buffers["mean"])
+        inverse_scale = cast(Tensor, self._buffers["inverse_scale"])
+        if takes_native(value, observed):
+            return scale_native(value, observed, mean if centred else None, inverse_scale, clip)
+        scaled = (value.double() - mean if centred else value.double()) * inverse_scale
+        if clip is not None:
+            scaled = scaled.clamp_(-clip, clip)
+        if observed is not None:
+            scaled = scaled.masked_fill_(observed.logical_not(), 0.0)
+        return scaled.to(value.dtype)
 
     def _store(self, moments: Moments) -> None:
         # Straight into the dictionary: nn.Module's own __setattr__ costs as much as the arithmetic.

@@ -23,7 +23,7 @@ from torchrl_drbpn.transforms._common import (
     transform_chain,
     unbounded_like,
 )
-from torchrl_drbpn.transforms._running import RunningMoments, RunningScaleTransform
+from torchrl_drbpn.transforms._running import RunningScaleTransform
 
 __all__ = ["MaskedObservationNorm"]
 
@@ -153,32 +153,21 @@ class MaskedObservationNorm(RunningScaleTransform):
                     f"entry for every component of {key!r}, got {observed.dtype} of shape "
                     f"{tuple(observed.shape)}. Is it the mask of another observation?"
                 )
-            double = value.double()
             if learns:
                 rows = flagged_rows(cast(TensorDictBase, flags), flag, key)
-                counted = observed
-                if rows is not None:
-                    rows = rows.unsqueeze(-1)
-                    counted = rows.expand_as(value) if observed is None else observed & rows
-                if not moments.learn(double, counted):
+                if not moments.learn(value, observed, rows):
                     raise ValueError(
                         f"`{key}` holds NaN or an infinity where {self.mask_keys[index]!r} says "
                         "that it was observed. For sensors that report NaN put ObservedFromNaN "
                         "before MaskedObservationNorm."
                     )
-            scaled = self._normalise(double, moments)
-            if observed is not None and not self._filled[index]:
-                scaled.masked_fill_(observed.logical_not(), 0.0)
-            store(tensordict, self.out_keys[index], scaled.to(value.dtype))
+            hidden = None if self._filled[index] else observed
+            store(tensordict, self.out_keys[index], moments.scale(value, hidden, clip=self.clip))
             complete = fetch(tensordict, self.complete_keys[index])
             if complete is not None:
-                scaled = self._normalise(complete.double(), moments)
-                store(tensordict, self.complete_keys[index], scaled.to(complete.dtype))
+                scaled = moments.scale(complete, None, clip=self.clip)
+                store(tensordict, self.complete_keys[index], scaled)
         return tensordict
-
-    def _normalise(self, value: Tensor, moments: RunningMoments) -> Tensor:
-        scaled = (value - moments.mean).mul_(moments.inverse_scale)
-        return scaled if self.clip is None else scaled.clamp_(-self.clip, self.clip)
 
     def _find_filled(self) -> list[bool]:
         filled: set[NestedKey] = set()

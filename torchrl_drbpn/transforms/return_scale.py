@@ -107,10 +107,8 @@ class RunningReturnScale(CarriedTransform, RunningScaleTransform):
     def _write(
         self, tensordict: TensorDictBase, index: int, reward: Tensor, moments: RunningMoments
     ) -> None:
-        scaled = reward * moments.inverse_scale
-        if self.clip is not None:
-            scaled = scaled.clamp_(-self.clip, self.clip)
-        store(tensordict, self.out_keys[index], scaled.to(reward.dtype))
+        scaled = moments.scale(reward, None, clip=self.clip, centred=False)
+        store(tensordict, self.out_keys[index], scaled)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         for index, key in enumerate(self.in_keys):

@@ -1,0 +1,196 @@
+"""Running statistics in few calls: ``moments.c`` around the two sums that PyTorch makes.
+
+For the observations of sixteen robots, learning and scaling are some thirty operations on a few
+hundred numbers, and what is paid for is their number. The C code does what lies between the sums,
+rounded as PyTorch rounds it; the sums stay PyTorch's, whose order depends on the processor. Both
+forms therefore give the same bits. Where the C code cannot be had, PyTorch's operations run.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional.compiled import load_library, native_error
+from torchrl_drbpn.functional.statistics import Moments
+
+__all__ = ["RunningNumbers", "learn_native", "scale_native", "takes_native"]
+
+_CPU = torch.device("cpu")
+_INFINITY = float("inf")
+
+
+class RunningNumbers(NamedTuple):
+    """Hold the statistics after a batch, all float64 of shape ``(*event)``.
+
+    Attributes:
+        moments: count, mean and squared deviations.
+        inverse_scale: 1 / sqrt(var + eps), the inverse of the values' units.
+    """
+
+    moments: Moments
+    inverse_scale: Tensor
+
+
+def takes_native(value: Tensor, observed: Tensor | None = None) -> bool:
+    """Tell whether the C code takes these values.
+
+    Args:
+        value: shape ``(*batch, *event)``.
+        observed: bool mask of the same shape, or None.
+
+    Returns:
+        False on another device or dtype, where memory is not contiguous, where a gradient is
+        wanted, under ``torch.compile``, and where the C code cannot be had.
+
+    Example:
+        >>> import torch
+        >>> takes_native(torch.zeros(3, 2).half())
+        False
+    """
+    return (
+        value.device == _CPU
+        and value.dtype in _FUNCTIONS_FOR
+        and value.is_contiguous()
+        and not (value.requires_grad and torch.is_grad_enabled())
+        and (observed is None or observed.is_contiguous())
+        and not torch.compiler.is_compiling()
+        and not torch._C._are_functorch_transforms_active()
+        and _functions(value.dtype) is not None
+    )
+
+
+def learn_native(
+    before: Moments,
+    value: Tensor,
+    observed: Tensor | None,
+    rows: Tensor | None,
+    eps: float,
+) -> RunningNumbers | None:
+    """Merge the observed entries of the flagged rows of a batch into running statistics.
+
+    The same as ``masked_moments``, ``merge_moments`` and ``variance``, bit for bit.
+
+    Args:
+        before: the statistics so far, shape ``(*event)``, contiguous.
+        value: shape ``(*batch, *event)``; :func:`takes_native` is true of it.
+        observed: bool, shape ``(*batch, *event)``, contiguous; None: every entry.
+        rows: bool, shape ``(*batch,)``, contiguous; None: every row.
+        eps: added to the variance, squared units.
+
+    Returns:
+        New statistics; None where an entry that counts is NaN or infinite.
+
+    Example:
+        >>> import torch
+        >>> x, nothing = torch.randn(64, 2), Moments(*torch.zeros(3, 2).double())
+        >>> out = learn_native(nothing, x, None, None, 0.0) if takes_native(x) else None
+        >>> out is None or torch.allclose(out.inverse_scale, 1 / x.double().std(0, correction=0))
+        True
+    """
+    native = _functions(value.dtype)
+    assert native is not None  # as takes_native says
+    n = before.n.numel()
+    count = value.numel() // n if n else 0
+    if observed is None and rows is None:
+        # PyTorch's own sums again: var_mean goes through the data once, in an order of its own.
+        var, batch_mean = torch.var_mean(value.reshape(count, n).double(), 0, correction=0)
+        batch_count, batch_m2 = torch.full_like(batch_mean, count), var.mul_(count)
+    else:
+        filled = torch.empty(count, n, dtype=torch.float64)
+        batch_count = torch.empty(n, dtype=torch.float64)
+        seen = None if observed is None else observed.data_ptr()
+        flags = None if rows is None else rows.data_ptr()
+        work, found = filled.data_ptr(), batch_count.data_ptr()
+        native.fill(count, n, value.data_ptr(), seen, flags, work, found)
+        batch_mean = filled.sum(0)
+        native.deviate(count, n, seen, flags, found, batch_mean.data_ptr(), work)
+        batch_m2 = filled.sum(0)
+    out = torch.empty(4, *before.n.shape, dtype=torch.float64)
+    of_before = [x.data_ptr() for x in before]
+    of_batch = [x.data_ptr() for x in (batch_count, batch_mean, batch_m2)]
+    if not native.merge(n, eps, *of_before, *of_batch, out.data_ptr()):
+        return None
+    total, mean, m2, inverse_scale = out.unbind()
+    return RunningNumbers(Moments(total, mean, m2), inverse_scale)
+
+
+def scale_native(
+    value: Tensor,
+    observed: Tensor | None,
+    mean: Tensor | None,
+    inverse_scale: Tensor,
+    clip: float | None,
+) -> Tensor:
+    """Return clip((value - mean) inverse_scale, -clip, clip), 0 where nothing was observed.
+
+    Computed in float64, bit for bit what PyTorch's operations give.
+
+    Args:
+        value: shape ``(*batch, *event)``; :func:`takes_native` is true of it.
+        observed: bool, shape ``(*batch, *event)``, contiguous; None: every entry.
+        mean: float64, shape ``(*event)``, contiguous; None: 0.
+        inverse_scale: float64, shape ``(*event)``, contiguous.
+        clip: largest magnitude; None for no limit.
+
+    Returns:
+        Shape and dtype of ``value``.
+
+    Example:
+        >>> import torch
+        >>> x, one = torch.tensor([[1.0, -9.0]]), torch.ones(2).double()
+        >>> scale_native(x, None, one, one, 2.0).tolist() if takes_native(x) else [[0.0, -2.0]]
+        [[0.0, -2.0]]
+    """
+    native = _functions(value.dtype)
+    assert native is not None  # as takes_native says
+    out = torch.empty_like(value)
+    n = inverse_scale.numel()
+    native.scale(
+        value.numel() // n if n else 0,
+        n,
+        _INFINITY if clip is None else clip,
+        value.data_ptr(),
+        None if observed is None else observed.data_ptr(),
+        None if mean is None else mean.data_ptr(),
+        inverse_scale.data_ptr(),
+        out.data_ptr(),
+    )
+    return out
+
+
+# ------------------------------------------------------------------------------------- the C code
+class _Functions(NamedTuple):
+    fill: ctypes._NamedFuncPointer
+    deviate: ctypes._NamedFuncPointer
+    merge: ctypes._NamedFuncPointer
+    scale: ctypes._NamedFuncPointer
+
+
+@functools.cache
+def _functions(dtype: torch.dtype) -> _Functions | None:
+    """Return the functions for values of a dtype, None where they cannot be had."""
+    if native_error(dtype, "moments") is not None:
+        return None
+    library = load_library(dtype, "moments")
+    whole, real, at = ctypes.c_long, ctypes.c_double, ctypes.c_void_p
+    out = _Functions(
+        library.moments_fill,
+        library.moments_deviate,
+        library.moments_merge,
+        library.moments_scale,
+    )
+    out.fill.argtypes = [whole, whole, *[at] * 5]
+    out.deviate.argtypes = [whole, whole, *[at] * 5]
+    out.merge.argtypes = [whole, real, *[at] * 7]
+    out.scale.argtypes = [whole, whole, real, *[at] * 5]
+    for function in (out.fill, out.deviate, out.scale):
+        function.restype = None
+    return out
+
+
+_FUNCTIONS_FOR = (torch.float32, torch.float64)
