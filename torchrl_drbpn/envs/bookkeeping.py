@@ -113,11 +113,30 @@ def _primer(part: TensorDictPrimer) -> Short | None:
         return None
 
     def step(root: _Entries, following: _Entries) -> bool:
-        del root
         # The policy has written the next recurrent state; where none has, the old one is carried.
-        return all(holds(following, key) for key in keys)
+        absent = [key for key in keys if not holds(following, key)]
+        if not all(holds(root, key) for key in absent):
+            return False
+        return all(_carry(root, following, key) for key in absent)
 
     return Short(step, zeroed=keys)
+
+
+def _carry(root: _Entries, following: _Entries, key: NestedKey) -> bool:
+    """Enter a root's entry into its next step; False where TensorDict itself has to do it."""
+    path = (key,) if isinstance(key, str) else key
+    for name in path[:-1]:
+        inner: Any = root[name]
+        if name not in following:
+            following[name] = TensorDict._new_unsafe(
+                {}, batch_size=inner.batch_size, device=inner.device
+            )
+        beside: Any = following[name]
+        if type(beside) is not TensorDict:
+            return False
+        root, following = inner._tensordict, beside._tensordict
+    following[path[-1]] = root[path[-1]]
+    return True
 
 
 def holds(entries: _Entries, key: NestedKey) -> bool:

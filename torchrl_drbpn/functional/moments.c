@@ -41,20 +41,22 @@ void moments_deviate(long rows, long n, const uint8_t *observed, const uint8_t *
         }
 }
 
-/* Merge a batch into count, mean, m2; out: the new three and the scale. 0: something not finite. */
-int moments_merge(long n, double eps, const double *count, const double *mean, const double *m2,
-                  const double *batch_count, const double *batch_mean, const double *batch_m2,
-                  double *out) {
-    double all = 0;
-    for (long j = 0; j < n; j++) all += batch_m2[j];
+/* Merge a batch into count, mean, m2; out: the new three and the scale. 0: something not finite.
+ * Without counts of its own the batch has `rows` samples of everything and variances, no sums. */
+int moments_merge(long rows, long n, double eps, const double *count, const double *mean,
+                  const double *m2, const double *batch_count, const double *batch_mean,
+                  const double *spread, double *out) {
+    double all = 0, factor = batch_count ? 1 : rows;
+    for (long j = 0; j < n; j++) all += spread[j] * factor;
     if (!isfinite(all)) return 0;
     for (long j = 0; j < n; j++) {
-        double total = count[j] + batch_count[j], delta = batch_mean[j] - mean[j];
-        double shift = batch_count[j] / (total < 1 ? 1 : total) * delta;
+        double added = batch_count ? batch_count[j] : rows, batch_m2 = spread[j] * factor;
+        double total = count[j] + added, delta = batch_mean[j] - mean[j];
+        double shift = added / (total < 1 ? 1 : total) * delta;
 #ifdef __FMA__ /* as PyTorch's addcmul where the processor has it */
-        double sum = fma(delta * count[j], shift, batch_m2[j] + m2[j]);
+        double sum = fma(delta * count[j], shift, batch_m2 + m2[j]);
 #else
-        double sum = (batch_m2[j] + m2[j]) + delta * count[j] * shift;
+        double sum = (batch_m2 + m2[j]) + delta * count[j] * shift;
 #endif
         out[j] = total;
         out[n + j] = shift + mean[j];

@@ -54,13 +54,12 @@ def takes_native(value: Tensor, observed: Tensor | None = None) -> bool:
     """
     return (
         value.device == _CPU
-        and value.dtype in _FUNCTIONS_FOR
         and value.is_contiguous()
         and not (value.requires_grad and torch.is_grad_enabled())
         and (observed is None or observed.is_contiguous())
         and not torch.compiler.is_compiling()
         and not torch._C._are_functorch_transforms_active()
-        and _functions(value.dtype) is not None
+        and _available(value.dtype)
     )
 
 
@@ -92,14 +91,14 @@ def learn_native(
         >>> out is None or torch.allclose(out.inverse_scale, 1 / x.double().std(0, correction=0))
         True
     """
-    native = _functions(value.dtype)
-    assert native is not None  # as takes_native says
+    native = _load(value.dtype)
     n = before.n.numel()
     count = value.numel() // n if n else 0
+    found = None
     if observed is None and rows is None:
         # PyTorch's own sums again: var_mean goes through the data once, in an order of its own.
-        var, batch_mean = torch.var_mean(value.reshape(count, n).double(), 0, correction=0)
-        batch_count, batch_m2 = torch.full_like(batch_mean, count), var.mul_(count)
+        double = value.double() if value.shape == (count, n) else value.reshape(count, n).double()
+        spread, mean = torch.var_mean(double, 0, correction=0)
     else:
         filled = torch.empty(count, n, dtype=torch.float64)
         batch_count = torch.empty(n, dtype=torch.float64)
@@ -107,16 +106,25 @@ def learn_native(
         flags = None if rows is None else rows.data_ptr()
         work, found = filled.data_ptr(), batch_count.data_ptr()
         native.fill(count, n, value.data_ptr(), seen, flags, work, found)
-        batch_mean = filled.sum(0)
-        native.deviate(count, n, seen, flags, found, batch_mean.data_ptr(), work)
-        batch_m2 = filled.sum(0)
+        mean = filled.sum(0)
+        native.deviate(count, n, seen, flags, found, mean.data_ptr(), work)
+        spread = filled.sum(0)
     out = torch.empty(4, *before.n.shape, dtype=torch.float64)
-    of_before = [x.data_ptr() for x in before]
-    of_batch = [x.data_ptr() for x in (batch_count, batch_mean, batch_m2)]
-    if not native.merge(n, eps, *of_before, *of_batch, out.data_ptr()):
+    if not native.merge(
+        count,
+        n,
+        eps,
+        before.n.data_ptr(),
+        before.mean.data_ptr(),
+        before.m2.data_ptr(),
+        found,
+        mean.data_ptr(),
+        spread.data_ptr(),
+        out.data_ptr(),
+    ):
         return None
-    total, mean, m2, inverse_scale = out.unbind()
-    return RunningNumbers(Moments(total, mean, m2), inverse_scale)
+    *moments, inverse_scale = out.unbind()
+    return RunningNumbers(Moments(*moments), inverse_scale)
 
 
 def scale_native(
@@ -146,8 +154,7 @@ def scale_native(
         >>> scale_native(x, None, one, one, 2.0).tolist() if takes_native(x) else [[0.0, -2.0]]
         [[0.0, -2.0]]
     """
-    native = _functions(value.dtype)
-    assert native is not None  # as takes_native says
+    native = _load(value.dtype)
     out = torch.empty_like(value)
     n = inverse_scale.numel()
     native.scale(
@@ -172,10 +179,13 @@ class _Functions(NamedTuple):
 
 
 @functools.cache
-def _functions(dtype: torch.dtype) -> _Functions | None:
-    """Return the functions for values of a dtype, None where they cannot be had."""
-    if native_error(dtype, "moments") is not None:
-        return None
+def _available(dtype: torch.dtype) -> bool:
+    return native_error(dtype, "moments") is None
+
+
+@functools.cache
+def _load(dtype: torch.dtype) -> _Functions:
+    """Return the functions for values of a dtype, with the types of their arguments."""
     library = load_library(dtype, "moments")
     whole, real, at = ctypes.c_long, ctypes.c_double, ctypes.c_void_p
     out = _Functions(
@@ -186,11 +196,8 @@ def _functions(dtype: torch.dtype) -> _Functions | None:
     )
     out.fill.argtypes = [whole, whole, *[at] * 5]
     out.deviate.argtypes = [whole, whole, *[at] * 5]
-    out.merge.argtypes = [whole, real, *[at] * 7]
+    out.merge.argtypes = [whole, whole, real, *[at] * 7]
     out.scale.argtypes = [whole, whole, real, *[at] * 5]
     for function in (out.fill, out.deviate, out.scale):
         function.restype = None
     return out
-
-
-_FUNCTIONS_FOR = (torch.float32, torch.float64)

@@ -66,9 +66,7 @@ class RunningMoments(nn.Module):
             zero = torch.zeros(event_shape, dtype=torch.float64, device=device)
             self._store(Moments(zero, zero.clone(), zero.clone()))
 
-    def learn(
-        self, value: Tensor, observed: Tensor | None, rows: Tensor | None = None
-    ) -> bool:
+    def learn(self, value: Tensor, observed: Tensor | None, rows: Tensor | None = None) -> bool:
         """Merge the observed entries of a batch into the statistics.
 
         Args:
