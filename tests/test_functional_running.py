@@ -87,5 +87,7 @@ def test_what_c_can_not_do_is_left_to_pytorch():
     assert takes_native(x)
     assert not takes_native(x.t()[1:].t())
     assert not takes_native(x, torch.ones(4, 8, dtype=torch.bool)[:, ::2])
+    assert not takes_native(x, torch.ones(4, 4))
+    assert not takes_native(x, torch.ones(4, 3, dtype=torch.bool))
     assert not takes_native(x.requires_grad_())
     assert not takes_native(x.detach().half())

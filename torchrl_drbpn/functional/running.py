@@ -56,7 +56,14 @@ def takes_native(value: Tensor, observed: Tensor | None = None) -> bool:
         value.device == _CPU
         and value.is_contiguous()
         and not (value.requires_grad and torch.is_grad_enabled())
-        and (observed is None or observed.is_contiguous())
+        and (
+            observed is None
+            or (
+                observed.dtype is torch.bool
+                and observed.shape == value.shape
+                and observed.is_contiguous()
+            )
+        )
         and not torch.compiler.is_compiling()
         and not torch._C._are_functorch_transforms_active()
         and _available(value.dtype)

@@ -81,7 +81,9 @@ class RunningMoments(nn.Module):
         count = cast(Tensor, buffers["count"])
         # A differentiable environment must not be remembered for ever.
         value = value.detach()
-        if takes_native(value, observed) and (rows is None or rows.is_contiguous()):
+        if self._takes_native(value, observed) and (
+            rows is None or (rows.dtype is torch.bool and rows.is_contiguous())
+        ):
             before = Moments(count, cast(Tensor, buffers["mean"]), cast(Tensor, buffers["m2"]))
             after = learn_native(before, value, observed, rows, self.eps)
             if after is None:
@@ -140,7 +142,7 @@ class RunningMoments(nn.Module):
         """
         mean = cast(Tensor, self._buffers["mean"])
         inverse_scale = cast(Tensor, self._buffers["inverse_scale"])
-        if takes_native(value, observed):
+        if self._takes_native(value, observed):
             return scale_native(value, observed, mean if centred else None, inverse_scale, clip)
         scaled = (value.double() - mean if centred else value.double()) * inverse_scale
         if clip is not None:
@@ -148,6 +150,16 @@ class RunningMoments(nn.Module):
         if observed is not None:
             scaled = scaled.masked_fill_(observed.logical_not(), 0.0)
         return scaled.to(value.dtype)
+
+    def _takes_native(self, value: Tensor, observed: Tensor | None) -> bool:
+        # C reads addresses: what a cast or a move of the module may have changed is looked at.
+        scale = cast(Tensor, self._buffers["inverse_scale"])
+        return (
+            scale.dtype is torch.float64
+            and scale.device == value.device
+            and value.shape[value.ndim - scale.ndim :] == scale.shape
+            and takes_native(value, observed)
+        )
 
     def _store(self, moments: Moments) -> None:
         # Straight into the dictionary: nn.Module's own __setattr__ costs as much as the arithmetic.
