@@ -25,6 +25,8 @@ from recipe import (
 from tensordict import TensorDictBase
 from timing import CLOCKS, finish, interleave, parser, start, table
 
+from torchrl_drbpn.functional import FilterOutput
+
 PARTS = (
     "filter",
     "heads and loss",
@@ -50,16 +52,19 @@ class Update:
         self.rows: list[dict[str, float]] = []
         self._in_filter = 0.0
         self._features_done: float | None = None
-        training.agent.belief.register_forward_pre_hook(self._enter)
-        training.agent.belief.register_forward_hook(self._leave)
+        # The loss calls the filter itself where it can; a hook on the module would change that.
+        belief = getattr(training.agent.belief, "filter", training.agent.belief)
+        belief.register_forward_pre_hook(self._enter)
+        belief.register_forward_hook(self._leave)
 
     def _enter(self, *_: Any) -> None:
         self._entered = self.clock()
 
     def _leave(self, _module: Any, _inputs: Any, out: Any) -> None:
         self._in_filter += self.clock() - self._entered
-        features = out.get("features")
-        if features.ndim == 3 and features.requires_grad:
+        features = out.mean if isinstance(out, FilterOutput) else out.get("features")
+        whole = features.shape[:2] == self.batch.shape  # not the pass over the last observations
+        if whole and features.requires_grad:
             # The engine computes this gradient when it has passed loss and heads.
             features.register_hook(self._mark)
 

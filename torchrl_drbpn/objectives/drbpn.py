@@ -16,7 +16,8 @@ from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_drbpn.modules import BeliefFilter, BeliefFilterModule
-from torchrl_drbpn.objectives._clipped import plain_terms
+from torchrl_drbpn.objectives._clipped import plain_heads, plain_terms
+from torchrl_drbpn.objectives._filtered import filtered_terms
 from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, last_steps
 
 __all__ = ["DRBPNLoss"]
@@ -212,6 +213,9 @@ class DRBPNLoss(LossModule):
                 f"`{keys.advantage}` is not in the tensordict: compute advantages over the whole "
                 "rollout first (TorchRL's GAE), then cut it into minibatches."
             )
+        plain = self._plain_forward(tensordict)
+        if plain is not None:
+            return plain
         data = tensordict.copy()
         params = self.filter_network_params
         with (
@@ -233,12 +237,33 @@ class DRBPNLoss(LossModule):
         model = None if self.model_loss is None else self.model_loss(data)
         if self.detach_belief:
             data.set(keys.features, data.get(keys.features).detach())
-        terms = plain_terms(self.ppo_loss, data)
-        out = self.ppo_loss(data) if terms is None else TensorDict(terms)
+        heads = plain_heads(self.ppo_loss, data)
+        out = (
+            self.ppo_loss(data)
+            if heads is None
+            else TensorDict(plain_terms(self.ppo_loss, heads, data, {}))
+        )
         if model is not None:
             for name, value in model.items():
                 out.set(name, self.model_coeff * value if name == "loss_model" else value)
         return out
+
+    def _plain_forward(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """Do the same without TensorDicts in between, where everything is of the usual kind."""
+        features = self.tensor_keys.features
+        heads = plain_heads(self.ppo_loss, tensordict)
+        if heads is None or self.filter_network_params is not None:
+            return None
+        filtered = filtered_terms(self.filter_network, self.model_loss, tensordict)
+        if filtered is None or features not in filtered[0]:
+            return None
+        written, model = filtered
+        if self.detach_belief:
+            written = {**written, features: written[features].detach()}
+        terms = plain_terms(self.ppo_loss, heads, tensordict, written)
+        for name, value in model.items():
+            terms[name] = self.model_coeff * value if name == "loss_model" else value
+        return TensorDict(terms)
 
     def _add_last_observations(self, data: TensorDictBase) -> None:
         """Write the likelihood of the next observation where no root step holds it.
