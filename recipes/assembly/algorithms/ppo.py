@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.modules.utils import get_primers_from_module
 
 from assembly.agent import Agent
+from assembly.algorithms.prepared import PreparedAdam
 from assembly.rollout import make_gae, minibatches, recompute_advantages, to_sequences
 from assembly.settings import Settings
 
@@ -100,6 +101,7 @@ def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
     parameters = list(ppo.agent.parameters())
     for group in optimizer.param_groups:
         group["lr"] = lr
+    prepared: PreparedAdam | None = None
     seen: dict[str, list[torch.Tensor]] = {}
     for epoch in range(optim.epochs):
         if epoch == 0 or optim.recompute_advantages:
@@ -112,11 +114,14 @@ def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
             for parameter in parameters:
                 parameter.grad = None
             torch.autograd.backward(total)
-            terms["grad_norm"] = _clip_gradients(parameters, optim.max_grad_norm)
-            optimizer.step()
+            stepped = [parameter for parameter in parameters if parameter.grad is not None]
+            terms["grad_norm"] = _clip_gradients(stepped, optim.max_grad_norm)
+            if prepared is None or not prepared.step(stepped):
+                optimizer.step()
+                prepared = PreparedAdam(optimizer, stepped)
             for key, value in terms.items():
                 seen.setdefault(key, []).append(value.detach())
-    means = {key: torch.stack([v.mean() for v in values]).mean() for key, values in seen.items()}
+    means = {key: torch.stack(values).mean() for key, values in seen.items()}
     return {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
 
 
