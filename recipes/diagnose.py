@@ -8,15 +8,14 @@ steps since a sensor was last seen.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 import torch
 from assembly.belief_figure import save_figure
-from assembly.console import run_or_explain, say
+from assembly.console import say, start
 from assembly.diagnosis import Tally, class_names, diagnose, pool
 from assembly.diagnosis_figures import (
     Series,
@@ -32,7 +31,7 @@ from assembly.report_runs import find_folders
 from assembly.run_folder import write_table
 from assembly.settings import MissingnessSettings, check_mode, missingness_name
 from assembly.trained import TrainedAgent, load_trained_agent
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 _FIGURES = ("precision.png", "outages.png", "reliability.png")
 
@@ -154,10 +153,7 @@ def _common(
 @hydra.main(version_base="1.3", config_path="../conf", config_name="diagnose")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
-    if status:
-        sys.exit(status)
+    start(run, config)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ with its 95 % interval over the nominal and the realised missing ratio.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 from assembly.belief_figure import save_figure
-from assembly.console import run_or_explain, say
+from assembly.console import say, start
 from assembly.errors import UserError
 from assembly.evaluation_grid import (
     Grid,
@@ -32,7 +31,7 @@ from assembly.robustness_figure import draw_robustness, read_rows
 from assembly.sensor_choice import kept_sensors
 from assembly.settings import check_mode
 from assembly.trained import TrainedAgent, load_trained_agent
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 
 def run(config: dict[str, Any]) -> int:
@@ -144,10 +143,7 @@ def _summary(rows: Sequence[dict[str, Any]], modes: Sequence[str]) -> str:
 @hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
-    if status:
-        sys.exit(status)
+    start(run, config)
 
 
 if __name__ == "__main__":

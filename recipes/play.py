@@ -8,23 +8,22 @@ alone.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 import torch
 from assembly.belief_figure import chosen_sensors
-from assembly.console import run_or_explain, say
+from assembly.console import say, start
 from assembly.errors import UserError
 from assembly.film import Film, Frame, robot_size
-from assembly.frames import render_poses
+from assembly.frames import render_or_say
 from assembly.points import parse_point, removed_sensors
 from assembly.recording import Recording, record_episode
 from assembly.settings import check_mode, missingness_name
 from assembly.trained import load_trained_agent
 from assembly.video import check_video, write_video
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 _WIDTHS = (240, 1920)  # pixels
 _COLOURS = (8, 256)
@@ -103,23 +102,16 @@ def _check(config: dict[str, Any]) -> Path:
 
 
 def _robot(recording: Recording, steps: range, size: int) -> list[Frame]:
-    """Draw the robot at each step, or say in one line why that can't be done here."""
+    """Draw the robot at each step, where that can be done."""
     width, height = robot_size(size)
     poses = [recording.poses[step] for step in steps]
-    try:
-        return render_poses(recording.model, recording.task, poses, width=width, height=height)
-    except RuntimeError as error:
-        say(f"no pictures of the robot, off-screen rendering failed: {error}")
-        return []
+    return render_or_say(recording.model, recording.task, poses, width=width, height=height)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="play")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
-    if status:
-        sys.exit(status)
+    start(run, config)
 
 
 if __name__ == "__main__":

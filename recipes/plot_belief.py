@@ -7,22 +7,21 @@ shows what complete sensors would have shown, what arrived, and the belief with 
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 import numpy as np
 import torch
 from assembly.belief_figure import chosen_sensors, draw_belief, frame_steps, save_figure
-from assembly.console import run_or_explain, say
+from assembly.console import say, start
 from assembly.errors import UserError
-from assembly.frames import render_poses
+from assembly.frames import render_or_say
 from assembly.points import read_point
 from assembly.recording import Recording, record_episode
 from assembly.settings import check_mode
 from assembly.trained import load_trained_agent
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 _FRAME_HEIGHT = 330  # pixels
 
@@ -79,30 +78,23 @@ def run(config: dict[str, Any]) -> int:
 
 
 def _frames(recording: Recording, count: int) -> list[Any]:
-    """Draw the robot, or say in one line why that can't be done here."""
+    """Draw the robot, where that can be done."""
     if not count:
         return []
     steps = frame_steps(min(count, len(recording.poses)), len(recording.poses))
-    try:
-        return render_poses(
-            recording.model,
-            recording.task,
-            [recording.poses[step] for step in steps],
-            width=_FRAME_HEIGHT * 3 // 4,
-            height=_FRAME_HEIGHT,
-        )
-    except RuntimeError as error:
-        say(f"no pictures of the robot, off-screen rendering failed: {error}")
-        return []
+    return render_or_say(
+        recording.model,
+        recording.task,
+        [recording.poses[step] for step in steps],
+        width=_FRAME_HEIGHT * 3 // 4,
+        height=_FRAME_HEIGHT,
+    )
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="plot_belief")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
-    if status:
-        sys.exit(status)
+    start(run, config)
 
 
 if __name__ == "__main__":

@@ -7,14 +7,13 @@ one step (observation_covariance.png). Runs of one task and one kind of training
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import hydra
 import torch
 from assembly.belief_figure import save_figure
-from assembly.console import run_or_explain, say
+from assembly.console import say, start
 from assembly.errors import UserError
 from assembly.report_runs import find_folders
 from assembly.run_folder import write_table
@@ -22,7 +21,7 @@ from assembly.sensor_choice import SensorModel, learned_sensors
 from assembly.sensor_figures import covariance_figure, ranking_figure
 from assembly.settings import missingness_name
 from assembly.trained import TrainedAgent, load_trained_agent
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 _Run = tuple[TrainedAgent, SensorModel]
 
@@ -124,10 +123,7 @@ def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, An
 @hydra.main(version_base="1.3", config_path="../conf", config_name="plot_sensors")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
-    if status:
-        sys.exit(status)
+    start(run, config)
 
 
 if __name__ == "__main__":

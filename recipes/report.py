@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 import tempfile
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 from assembly.belief_figure import save_figure
-from assembly.console import run_or_explain, say
+from assembly.console import say, start
 from assembly.errors import UserError
 from assembly.report_figures import learning_curves, robustness
 from assembly.report_index import index_page, studies_of
@@ -30,7 +29,7 @@ from assembly.report_paper import aggregate_rows, efficiency_rows, margin_rows
 from assembly.report_runs import find_folders, read_study
 from assembly.report_tables import evaluation_rows, summary_rows, training_rows
 from assembly.run_folder import write_table, write_whole
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 NOTES_FILE = "notes.md"
 # In this order: the page, which names the others, comes last.
@@ -146,10 +145,7 @@ def _notes(out: Path) -> str:
 @hydra.main(version_base="1.3", config_path="../conf", config_name="report")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
-    if status:
-        sys.exit(status)
+    start(run, config)
 
 
 if __name__ == "__main__":

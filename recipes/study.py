@@ -15,17 +15,16 @@ out=results/robust`` then makes the tables.
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
-from assembly.console import run_or_explain
+from assembly.console import start
 from assembly.errors import UserError
 from assembly.study_cells import StudyFolder
 from assembly.study_grid import read_grid
 from assembly.study_job import StudyJob
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 
 def run(config: dict[str, Any]) -> int:
@@ -65,10 +64,7 @@ def run(config: dict[str, Any]) -> int:
 @hydra.main(version_base="1.3", config_path="../conf", config_name="study")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
-    if status:
-        sys.exit(status)
+    start(run, config)
 
 
 if __name__ == "__main__":

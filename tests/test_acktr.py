@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,15 +31,6 @@ from assembly.settings import read_settings
 from assembly.training import Training, assemble, make_agent, train_rollout
 
 SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.steps=3")
-
-
-@pytest.fixture(autouse=True)
-def _global_state() -> Iterator[None]:
-    """Recipes set the global generator and the number of threads; give them back."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng(devices=[]):
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

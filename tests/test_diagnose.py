@@ -12,7 +12,6 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -56,15 +55,6 @@ DEFAULTS: dict[str, Any] = {
     "resamples": 20,
     "threads": 1,
 }
-
-
-@pytest.fixture(autouse=True)
-def _global_state() -> Iterator[None]:
-    """Recipes set the global generator and the number of threads; give them back."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng(devices=[]):
-        yield
-    torch.set_num_threads(threads)
 
 
 def make_folder(folder: Path, *overrides: str) -> Path:

@@ -302,6 +302,7 @@ def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path) -> None
     ("options", "what"),
     [
         ({"run": None}, "`run` must name a run folder"),
+        ({"run": "no/such/run"}, "there is no folder no/such/run"),
         ({"episodes": 0}, "`episodes` must be a whole number of at least 1"),
         ({"processes": 0}, "`processes` must be a whole number"),
         ({"modes": ["best"]}, "`modes` must hold sampled and mean"),
@@ -322,16 +323,19 @@ def test_bad_settings_are_one_line(
 def test_groups_hold_every_component_once_in_every_named_task() -> None:
     sizes = {("Reacher", "v4"): 11, ("Reacher", "v5"): 10}
     for task, version in named_tasks():
+        grouped = 0
         for obs_dim in [sizes[task, version]] if (task, version) in sizes else range(4, 400):
             try:
                 names = sensor_names(task, version, obs_dim)
             except UserError:
-                continue
+                continue  # no size of this task; some size is
+            grouped += 1
             for by in ("joint", "kind"):
                 groups = sensor_groups(names, by)
                 assert groups is not None
                 assert sorted(i for group in groups for i in group) == list(range(obs_dim))
                 assert 1 < len(groups) < obs_dim, (task, by)
+        assert grouped, (task, version)
 
 
 def test_a_joint_is_its_angle_and_its_velocity_and_a_kind_all_positions() -> None:

@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -26,6 +24,7 @@ pytest.importorskip("matplotlib")
 from recipe_tools import make_folder  # isort: skip
 
 import play
+from assembly import frames
 from assembly.belief_figure import ABSENT, BELIEF, MISSING
 from assembly.errors import UserError
 from assembly.film import Film, robot_size
@@ -38,15 +37,6 @@ from omegaconf import OmegaConf
 CONF = Path(__file__).parents[1] / "conf" / "play.yaml"
 # Small, and without the robot: rendering needs what a machine may lack.
 SMALL = {"start": 0, "steps": 6, "sensors": 2, "window": 4, "size": 240, "robot": False, "seed": 4}
-
-
-@pytest.fixture(autouse=True)
-def _global_state() -> Iterator[None]:
-    """Recipes set the global generator and the number of threads; give them back."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng(devices=[]):
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +94,13 @@ def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(
 
 
 def test_without_a_name_the_film_lies_in_the_run_folder(folder: Path) -> None:
-    film(folder, None, steps=2)
-    (folder / "play.gif").unlink()
+    before = set(folder.iterdir())
+    assert film(folder, None, steps=2) == 0
+    (out,) = set(folder.iterdir()) - before
+    assert out.name == "play.gif"
+    with Image.open(out) as video:
+        assert (video.format, video.n_frames) == ("GIF", 2)
+    out.unlink()
 
 
 def test_the_same_command_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
@@ -231,7 +226,7 @@ def test_where_nothing_can_be_rendered_the_rest_is_filmed_and_one_line_says_so(
     def broken(*_: Any, **__: Any) -> None:
         raise RuntimeError("no display")
 
-    monkeypatch.setattr(play, "render_poses", broken)
+    monkeypatch.setattr(frames, "render_poses", broken)
     assert film(folder, tmp_path / "film.gif", robot=True) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "no pictures of the robot, off-screen rendering failed: no display"

@@ -8,20 +8,19 @@ line.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
 from recipe_tools import make_config, make_folder  # isort: skip
 
 import plot_belief
+from assembly import frames
 from assembly.belief_figure import draw_belief, frame_steps, most_missing, save_figure
 from assembly.errors import UserError
 from assembly.frames import render_poses
@@ -32,15 +31,6 @@ from assembly.trained import load_trained_agent
 from matplotlib.image import imread
 
 DEFAULTS = {"mode": "sampled", "start": 0, "steps": 12, "sensors": 2, "frames": 0, "seed": 4}
-
-
-@pytest.fixture(autouse=True)
-def _global_state() -> Iterator[None]:
-    """Recipes set the global generator and the number of threads; give them back."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng(devices=[]):
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +124,7 @@ def test_where_nothing_can_be_rendered_the_rest_is_drawn_and_one_line_says_so(
     def broken(*_: Any, **__: Any) -> None:
         raise RuntimeError("no display")
 
-    monkeypatch.setattr(plot_belief, "render_poses", broken)
+    monkeypatch.setattr(frames, "render_poses", broken)
     assert draw(folder, tmp_path / "belief.png", frames=2) == 0
     assert (tmp_path / "belief.png").stat().st_size > 10_000
     said = capsys.readouterr().out.splitlines()

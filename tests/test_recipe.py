@@ -17,7 +17,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +39,6 @@ from assembly.trained import load_trained_agent
 from assembly.training import assemble, restore, train_rollout, training_state
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.2")
-
-
-@pytest.fixture(autouse=True)
-def _global_state() -> Iterator[None]:
-    """Recipes set the global generator and the number of threads; give them back."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng(devices=[]):
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -36,15 +35,6 @@ SMOKE = (
     "evaluation.every_frames=0",
 )
 LINE = "env.backend=envpool can't save the state of InvertedPendulum-v5: going on with new episodes"
-
-
-@pytest.fixture(autouse=True)
-def _global_state() -> Iterator[None]:
-    """Recipes set the global generator and the number of threads; give them back."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng(devices=[]):
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -89,5 +89,5 @@ def test_a_belief_without_memory_learns_from_single_steps():
     lengths = {}
     for belief in ("none", "fill", "gru", "drbpn"):
         training, data = collected(f"belief={belief}", "optim.sequence_length=8")
-        lengths[belief] = training.algorithm.sequences(data, 0).shape[1]
+        lengths[belief] = next(training.algorithm.epochs(data)).shape[1]
     assert lengths == {"none": 1, "fill": 1, "gru": 8, "drbpn": 8}

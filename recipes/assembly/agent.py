@@ -125,7 +125,9 @@ class Agent(nn.Module):
         return self.critic.module(*(tensordict.get(key) for key in self.critic.in_keys))
 
     @torch.no_grad()
-    def one_step_value(self, tensordict: TensorDictBase) -> torch.Tensor:
+    def one_step_value(
+        self, tensordict: TensorDictBase, where: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Return V of the beliefs that one step of the belief module makes of what is stored.
 
         A stored step holds what arrived, the action before it and the belief before it, so one
@@ -134,13 +136,16 @@ class Agent(nn.Module):
 
         Args:
             tensordict: a rollout or its ``"next"``, any shape.
+            where: bool of that shape; the steps to value. None: all.
 
         Returns:
-            Values, shape ``(*, 1)``.
+            Values, shape ``(*, 1)``; with ``where`` shape ``(count, 1)``.
         """
         keys = (*self.belief.in_keys, *self.critic.in_keys)
-        single = tensordict.select(*keys, strict=False).reshape(-1)
-        return self.value(self.belief(single)).reshape(*tensordict.shape, 1)
+        read = tensordict.select(*keys, strict=False)
+        single = read.reshape(-1) if where is None else read[where]
+        value = self.value(self.belief(single))
+        return value if where is not None else value.reshape(*tensordict.shape, 1)
 
 
 class _SideBySide(nn.Sequential):

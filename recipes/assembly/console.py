@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from assembly.errors import UserError
@@ -83,6 +84,19 @@ def say(text: str) -> None:
     """
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
+
+
+def start(run: Callable[[dict[str, Any]], int], config: DictConfig) -> None:
+    """Run what a command composed; leave with its status where it is not 0.
+
+    Args:
+        run: the command, on a plain configuration.
+        config: what Hydra composed.
+    """
+    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    status = run_or_explain(lambda: run(plain))
+    if status:
+        sys.exit(status)
 
 
 def run_or_explain(job: Callable[[], int]) -> int:

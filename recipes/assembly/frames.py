@@ -12,6 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from assembly.console import say
+
 # Tasks that lie flat are looked at from above; the others from the side.
 _FROM_ABOVE = ("Reacher", "Swimmer")
 _SIDE, _ABOVE = -5.0, -90.0  # elevation of the camera, degrees
@@ -121,3 +123,30 @@ def _on_white(model: Any) -> Any:
 
 def _is_plane(model: Any, geom: int) -> bool:
     return bool(model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE)
+
+
+def render_or_say(
+    model: Any,
+    task: str,
+    poses: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    *,
+    width: int,
+    height: int,
+) -> list[NDArray[np.uint8]]:
+    """Draw a robot in each pose, or say in one line why that can't be done here.
+
+    Args:
+        model: see :func:`render_poses`, as are the others.
+        task: name of the task.
+        poses: positions and velocities.
+        width: pixels.
+        height: pixels.
+
+    Returns:
+        The pictures; none where off-screen rendering fails.
+    """
+    try:
+        return render_poses(model, task, poses, width=width, height=height)
+    except RuntimeError as error:
+        say(f"no pictures of the robot, off-screen rendering failed: {error}")
+        return []

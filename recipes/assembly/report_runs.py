@@ -90,7 +90,7 @@ def find_folders(wanted: str | Sequence[str]) -> list[Path]:
         Folders, each once, sorted. A pattern gives the folders with a config.yaml.
 
     Raises:
-        UserError: if there is none.
+        UserError: if there is none, or one that is named does not exist.
     """
     found: set[Path] = set()
     for text in [wanted] if isinstance(wanted, str) else wanted:
@@ -100,6 +100,11 @@ def find_folders(wanted: str | Sequence[str]) -> list[Path]:
             if not runs:
                 raise UserError(f"`run` must name run folders, {text} matches none.")
             found.update(runs)
+        elif not Path(text).is_dir():
+            raise UserError(
+                f"`run` must name run folders, there is no folder {text}: give the one that "
+                "ppo_drbpn.py printed."
+            )
         else:
             found.add(Path(text))
     if not found:

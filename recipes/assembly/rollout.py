@@ -13,6 +13,8 @@ from torchrl.objectives.value import GAE
 from assembly.agent import Agent
 from assembly.settings import LossSettings
 
+_ESTIMATES = ("advantage", "value_target", "state_value")
+
 
 def make_gae(settings: LossSettings) -> GAE:
     """Build TorchRL's estimator of advantages from values that are there already.
@@ -41,10 +43,8 @@ def recompute_advantages(data: TensorDictBase, agent: Agent, gae: GAE) -> None:
         agent: the agent as it is now.
         gae: see :func:`make_gae`.
     """
-    following = data.get("next")
     data.set("state_value", agent.one_step_value(data))
-    following.set("state_value", agent.one_step_value(following))
-    gae(data)
+    _estimate(data, agent, gae)
 
 
 @torch.no_grad()
@@ -57,9 +57,33 @@ def add_advantages(data: TensorDictBase, agent: Agent, gae: GAE) -> None:
         gae: see :func:`make_gae`.
     """
     data.set("state_value", agent.value(data))
-    following = data.get("next")
-    following.set("state_value", agent.one_step_value(following))
+    _estimate(data, agent, gae)
+
+
+def _estimate(data: TensorDictBase, agent: Agent, gae: GAE) -> None:
+    """Write next values and advantages beside the values.
+
+    Where an episode goes on, the belief that follows a step is the one stored at the next step, and
+    so is its value: only where one ends, or the rollout is cut, is there another one to value.
+    """
+    value, following = data.get("state_value"), data.get("next")
+    ends = following.get("done").squeeze(-1).clone()
+    ends[:, -1] = True
+    next_value = torch.cat([value[:, 1:], value[:, :1]], 1)
+    next_value[ends] = agent.one_step_value(following, ends)
+    following.set("state_value", next_value)
     gae(data)
+
+
+def copy_advantages(data: TensorDictBase, sequences: TensorDict) -> None:
+    """Bring values and advantages of a rollout into the sequences that were cut from it.
+
+    Args:
+        data: rollout of batch size ``(environments, time)``.
+        sequences: from :func:`to_sequences`; changed in place.
+    """
+    for key in _ESTIMATES:
+        sequences.get(key).copy_(data.get(key).reshape(*sequences.shape, 1))
 
 
 def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorDict:
@@ -80,7 +104,7 @@ def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorD
     final = torch.zeros(*data.shape, 1, dtype=torch.bool)
     final[:, -1] = True
     tensors: dict[NestedKey, torch.Tensor] = {"final": final}
-    for key in (*loss.in_keys, "advantage", "value_target", "state_value"):
+    for key in (*loss.in_keys, *_ESTIMATES):
         value = data.get(key, None)
         if value is not None:
             tensors[key] = value

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -11,7 +11,13 @@ from torchrl.modules.utils import get_primers_from_module
 
 from assembly.agent import Agent
 from assembly.algorithms.prepared import PreparedAdam
-from assembly.rollout import make_gae, minibatches, recompute_advantages, to_sequences
+from assembly.rollout import (
+    copy_advantages,
+    make_gae,
+    minibatches,
+    recompute_advantages,
+    to_sequences,
+)
 from assembly.settings import Settings
 
 _NAMES = {"kl_approx": "kl", "ESS": "ess"}
@@ -59,20 +65,23 @@ class PPO:
         lr = self.optim.lr * remaining
         return {**_update(self, data, lr), "lr": lr}
 
-    def sequences(self, data: TensorDictBase, epoch: int) -> TensorDict:
-        """Return what the minibatches of an epoch are cut from.
+    def epochs(self, data: TensorDictBase) -> Iterator[TensorDict]:
+        """Yield what the minibatches of each epoch are cut from.
 
         Args:
             data: rollout of batch size ``(environments, time)`` with advantages; they are
                 changed in place where they are recomputed.
-            epoch: from 0.
 
-        Returns:
-            Sequences, batch size ``(environments * time / length, length)``.
+        Yields:
+            Sequences, batch size ``(environments * time / length, length)``; the same object with
+            other advantages where they are recomputed.
         """
-        if epoch and self.optim.recompute_advantages:
-            recompute_advantages(data, self.agent, self.gae)
-        return to_sequences(data, self.loss, self.sequence_length)
+        sequences = to_sequences(data, self.loss, self.sequence_length)
+        for epoch in range(self.optim.epochs):
+            if epoch and self.optim.recompute_advantages:
+                recompute_advantages(data, self.agent, self.gae)
+                copy_advantages(data, sequences)
+            yield sequences
 
     def state_dict(self) -> dict[str, Any]:
         """Return the optimiser's state and the generator's.
@@ -103,9 +112,7 @@ def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
         group["lr"] = lr
     prepared: PreparedAdam | None = None
     seen: dict[str, list[torch.Tensor]] = {}
-    for epoch in range(optim.epochs):
-        if epoch == 0 or optim.recompute_advantages:
-            sequences = ppo.sequences(data, epoch)
+    for sequences in ppo.epochs(data):
         for minibatch in minibatches(sequences, optim.minibatches, ppo.generator):
             out = loss(minibatch)
             terms = {key: value for key, value in out.items() if isinstance(value, torch.Tensor)}
@@ -115,7 +122,8 @@ def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
                 parameter.grad = None
             torch.autograd.backward(total)
             stepped = [parameter for parameter in parameters if parameter.grad is not None]
-            terms["grad_norm"] = _clip_gradients(stepped, optim.max_grad_norm)
+            gradients = [p.grad for p in stepped if p.grad is not None]
+            terms["grad_norm"] = _clip(gradients, optim.max_grad_norm)
             if prepared is None or not prepared.step(stepped):
                 optimizer.step()
                 prepared = PreparedAdam(optimizer, stepped)
@@ -125,12 +133,11 @@ def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
     return {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
 
 
-def _clip_gradients(parameters: list[torch.nn.Parameter], limit: float) -> torch.Tensor:
+def _clip(gradients: list[torch.Tensor], limit: float) -> torch.Tensor:
     """Scale the gradient down to norm ``limit``, as clip_grad_norm_ does; return its norm.
 
     Without sorting the parameters by device and dtype at every step: here all have one.
     """
-    gradients = [p.grad for p in parameters if p.grad is not None]
     norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     torch._foreach_mul_(gradients, (limit / (norm + 1e-6)).clamp_max_(1.0))
     return norm
