@@ -407,7 +407,7 @@ def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(
     ("changes", "message"),
     [
         ({"run": None}, "`run` must name run folders"),
-        ({"run": "nowhere"}, "`nowhere` must be a run folder"),
+        ({"run": "nowhere"}, "there is no folder nowhere"),
         ({"points": []}, "`points` must hold at least one"),
         ({"points": ["mcar:2"]}, "`points` must hold"),
         ({"mode": "best"}, "`modes` must hold"),

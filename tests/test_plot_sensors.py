@@ -259,7 +259,7 @@ def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(copied: Path)
     [
         ({"run": None}, "`run` must name run folders"),
         ({"run": "nowhere/*"}, "`run` must name run folders, nowhere/\\* matches none"),
-        ({"run": "nowhere"}, "`nowhere` must be a run folder"),
+        ({"run": "nowhere"}, "there is no folder nowhere"),
         ({"run": str(RUNS / "hopper*"), "out": None}, "`out` must name a folder for .* 3 runs"),
         ({"orders": 5}, "`orders` must be 20 or more"),
         ({"dpi": 0}, "`dpi` 1 or more"),
