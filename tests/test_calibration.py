@@ -250,6 +250,13 @@ def test_coverage_of_a_wrong_deviation_is_that_of_the_intervals_it_draws(factor:
     assert (central_coverage(pit, LEVELS) - expected).abs().max() < 0.012
 
 
+def test_central_intervals_end_at_the_same_distance_from_both_ends() -> None:
+    low, high = torch.tensor(0.1, dtype=torch.float64), torch.tensor(0.9, dtype=torch.float64)
+    levels = torch.tensor([0.799, 0.801], dtype=torch.float64)
+    for pit in (low, high):
+        assert central_coverage(pit, levels).tolist() == [0.0, 1.0]
+
+
 def test_a_biased_forecast_puts_the_reliability_curve_on_one_side() -> None:
     pit = gaussian_pit(randn(5_000) + 0.5, torch.zeros(1), torch.ones(1))
     levels = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)

@@ -1,6 +1,7 @@
-"""optim.recompute_advantages: values and advantages by the current parameters, epoch by epoch.
+"""What the epochs of an update are cut from; optim.recompute_advantages.
 
-With the parameters that collected the rollout nothing changes; without memory the result is
+Of the rollout the last step of every environment alone is final. Recomputed are values and
+advantages by the current parameters, epoch by epoch: with the parameters that collected the rollout nothing changes; without memory the result is
 TorchRL's GAE with the network itself; the first epoch is that of the plain update; a run with it is
 as reproducible as one without.
 """
@@ -91,3 +92,12 @@ def test_a_belief_without_memory_learns_from_single_steps():
         training, data = collected(f"belief={belief}", "optim.sequence_length=8")
         lengths[belief] = next(training.algorithm.epochs(data)).shape[1]
     assert lengths == {"none": 1, "fill": 1, "gru": 8, "drbpn": 8}
+
+
+def test_the_last_step_of_every_environment_is_final_and_no_other():
+    training, data = collected("optim.sequence_length=8")
+    envs, time = data.shape
+    assert time > 8  # cuts inside the rollout are among the others
+    final = next(training.algorithm.epochs(data))["final"].reshape(envs, time)
+    assert final[:, -1].all()
+    assert not final[:, :-1].any()
