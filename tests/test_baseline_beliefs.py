@@ -74,17 +74,23 @@ def test_a_wrong_cell_is_named():
         make_belief("gru belief.cell=rnn")
 
 
-def test_filling_leaves_the_last_value_where_nothing_arrived():
+def test_filling_holds_the_last_normalised_value_and_the_mean_before_the_first():
     from assembly.settings import read_settings
     from assembly.training import assemble
 
     with torch.random.fork_rng():
         config = recipe_tools.make_config("experiment=smoke", "belief=fill", "missingness=mcar")
         data = assemble(read_settings(config)).collector.rollout()
-    # a gap of the normalised observation reads 0; of a filled one, the last reading
-    gaps = ~data["observed"]
-    assert gaps.float().mean() > 0.1
-    assert (data["features"][gaps] != 0).float().mean() > 0.9
+    seen, value, start = data["observed"], data["observation"], data["is_init"]
+    held = torch.zeros_like(value[:, 0])  # 0 is the running mean, which raw 0 may be far from
+    never = 0
+    for t in range(data.shape[1]):
+        held = torch.where(start[:, t], 0.0, held)
+        held = torch.where(seen[:, t], value[:, t], held)
+        assert torch.equal(data["features"][:, t], held)
+        never += int((held == 0).sum())
+    assert never > 0
+    assert (data["features"][~seen] != 0).float().mean() > 0.5
 
 
 def test_the_transformer_forgets_what_lies_beyond_its_window():

@@ -59,6 +59,7 @@ def make_environment(
     gamma: float,
     seed: int,
     before_normalisation: Sequence[Transform] = (),
+    after_normalisation: Sequence[Transform] = (),
     complete: bool = False,
 ) -> TransformedEnv:
     """Build the batched, corrupted, normalised environment of a run.
@@ -72,7 +73,8 @@ def make_environment(
         num_threads: threads that step them; results do not depend on it.
         gamma: discount of the return whose deviation scales the reward.
         seed: seed of episodes and corruption.
-        before_normalisation: further transforms that a belief module asks for.
+        before_normalisation: further transforms that take entries away.
+        after_normalisation: further transforms that a belief module asks for.
         complete: whether to write ``complete_observation`` too: what complete, noiseless sensors
             would have shown, normalised with the same statistics. No policy reads it.
 
@@ -98,6 +100,7 @@ def make_environment(
         make_missingness(env, missingness, base.observation_spec["observation"].shape[-1], key),
         *before_normalisation,
         MaskedObservationNorm(clip=normalisation.observation_clip),
+        *after_normalisation,
         RunningReturnScale(
             gamma=gamma,
             clip=normalisation.reward_clip,

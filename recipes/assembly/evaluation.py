@@ -102,7 +102,8 @@ def make_evaluation_environment(
         gamma=settings.loss.gamma,
         seed=settings.evaluation.seed,
         complete=complete,
-        before_normalisation=[*reduction, *belief.transforms()],
+        before_normalisation=reduction,
+        after_normalisation=belief.transforms(),
     )
     add_primers(env, agent)
     return env

@@ -61,7 +61,7 @@ def load_trained_agent(folder: Path) -> TrainedAgent:
         num_threads=1,
         gamma=settings.loss.gamma,
         seed=settings.seed,
-        before_normalisation=belief.transforms(),
+        after_normalisation=belief.transforms(),
     )
     add_primers(statistics, agent)
     try:

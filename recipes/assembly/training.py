@@ -87,7 +87,7 @@ def assemble(settings: Settings) -> Training:
         num_threads=settings.collector.num_threads,
         gamma=settings.loss.gamma,
         seed=settings.seed,
-        before_normalisation=belief.transforms(),
+        after_normalisation=belief.transforms(),
         complete=COMPLETE in agent.critic.in_keys,
     )
     add_primers(env, agent)

@@ -45,7 +45,7 @@ class Belief:
             by default and over time under ``set_recurrent_mode(True)``.
         feature_dim: components of ``features``.
         model_loss: the loss of the belief's own model, or None where it has none.
-        transforms: makes further environment transforms, between missingness and normalisation.
+        transforms: makes further environment transforms, right after normalisation.
         summary: numbers worth a column in metrics.csv, asked for once a rollout.
         observing: makes a module with the weights of ``module`` that also writes what the belief
             knows of the sensors (see the top of this file); None where it knows nothing.

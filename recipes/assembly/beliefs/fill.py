@@ -20,7 +20,8 @@ def build(*, obs_dim: int, action_dim: int, normalize: str, with_mask: bool) -> 
         with_mask: whether the heads also read which entries arrived.
 
     Returns:
-        The belief; its transform fills the observations before they are normalised.
+        The belief; its transform fills normalised observations, so that an entry which has not
+        arrived in this episode yet reads 0, its running mean, as it does for ``belief=none``.
     """
     del action_dim, normalize
     module = TensorDictModule(
