@@ -1,4 +1,4 @@
-"""A transformer memory over the last steps of the episode."""
+"""A transformer with a memory of its layers' inputs over the last steps of the episode."""
 
 from __future__ import annotations
 
@@ -17,26 +17,132 @@ from assembly.beliefs import Belief
 from assembly.beliefs.foresight import Foresight, foreseeing
 from torchrl_drbpn import BeliefModelLoss
 
-_WINDOW: NestedKey = ("recurrent", "window")
+_MEMORY: NestedKey = ("recurrent", "memory")
 _LENGTH: NestedKey = ("recurrent", "length")
 _HIDDEN: NestedKey = ("recurrent", "hidden")
-_STATE = (_WINDOW, _LENGTH, _HIDDEN)
+_STATE = (_MEMORY, _LENGTH, _HIDDEN)
+
+
+class MemoryAttention(nn.Module):
+    r"""Multi-head attention of some steps over themselves and the steps before them.
+
+    For each head with head dimension d, a query x, keys and values m_j, and a bias b_j:
+
+    .. math::
+        p = \mathrm{softmax}_j\big((W_q x + c)^\top W_k m_j / \sqrt d + b_j\big), \qquad
+        y = \sum_{heads} W_o W_v \sum_j p_j m_j + e
+
+    What ``nn.MultiheadAttention`` computes, in another order: W_k is applied to the query and W_v
+    to the average, so that no step of the memory is projected again. A bias of the keys shifts all
+    scores alike and one of the values adds to e: there is neither.
+
+    Args:
+        width: of the steps.
+        heads: attention heads; divides the width.
+    """
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads, self.head_dim = heads, width // heads
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width, bias=False)
+        self.value = nn.Linear(width, width, bias=False)
+        self.out = nn.Linear(width, width)
+        for layer in (self.query, self.key, self.value):
+            # Where nn.MultiheadAttention starts: the three as one matrix.
+            nn.init.xavier_uniform_(layer.weight, gain=0.5**0.5)
+        nn.init.zeros_(self.query.bias)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, entries: Tensor, bias: Tensor) -> Tensor:
+        """Attend from the last steps.
+
+        Args:
+            entries: the memory, then the steps, shape ``(rows, entries, width)``.
+            bias: added to the scores, -inf where a step does not see an entry, shape
+                ``(rows, time, heads, entries)``.
+
+        Returns:
+            Shape ``(rows, time, width)``.
+        """
+        rows, time, heads, count = bias.shape
+        width = entries.shape[-1]
+        split = (heads, self.head_dim, width)
+        query = self.query(entries[:, -time:]).reshape(rows * time, heads, self.head_dim)
+        query = torch.bmm(query.transpose(0, 1), self.key.weight.view(split)).transpose(0, 1)
+        scores = torch.baddbmm(
+            bias.reshape(rows, time * heads, count),
+            query.reshape(rows, time * heads, width),
+            entries.transpose(1, 2),
+            alpha=self.head_dim**-0.5,
+        )
+        mean = torch.bmm(scores.softmax(-1), entries).reshape(rows * time, heads, width)
+        value = self.value.weight.view(split).transpose(1, 2)
+        value = torch.bmm(mean.transpose(0, 1), value).transpose(0, 1)
+        out: Tensor = self.out(value.reshape(rows, time, width))
+        return out
+
+
+class MemoryLayer(nn.Module):
+    """A pre-norm encoder layer that attends over its own inputs at earlier steps.
+
+    Args:
+        width: of the steps.
+        heads: attention heads; divides the width.
+    """
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        # Without a scale of its own: those of the projections do it, and what is remembered
+        # depends on the layers below alone.
+        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.attention = MemoryAttention(width, heads)
+        self.feedforward = nn.Sequential(
+            nn.LayerNorm(width),
+            nn.Linear(width, 2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, width),
+        )
+
+    def forward(self, x: Tensor, memory: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+        """Take some steps through the layer.
+
+        Args:
+            x: the steps, shape ``(rows, time, width)``.
+            memory: normalised inputs of the layer at the steps before, oldest first, shape
+                ``(rows, remembered, width)``.
+            bias: see :class:`MemoryAttention`.
+
+        Returns:
+            The steps' outputs, and the memory with their normalised inputs after it.
+        """
+        entries = torch.cat([memory, self.norm(x)], 1)
+        x = x + self.attention(entries, bias)
+        return x + self.feedforward(x), entries
 
 
 class TransformerBelief(TensorDictModuleBase):
     """Attend over the last k steps: what arrived, which entries did, the action before.
 
-    The recurrent state is the window itself, so that a step seen alone and the same step seen in
-    a sequence attend over the same k steps, however the rollout was cut. The features are the
-    output at the newest step; the auxiliary task is that of the recurrent networks.
+    A causal transformer with a memory, as Transformer-XL [Dai et al. 2019] and, for reinforcement
+    learning, GTrXL [Parisotto et al. 2020]: a step passes through the layers once, and each layer
+    attends over the step and its own inputs at the k - 1 steps before it in the same episode. With
+    several layers the features so depend on the last ``layers * (k - 1) + 1`` steps. A learned
+    bias per head and distance tells the steps apart.
+
+    The recurrent state is the memory: normalised inputs of every layer, half of what keys and
+    values would take, and what the current weights make keys and values of. No gradient flows
+    into it. A step seen alone and the same step seen in a sequence give the same features, however
+    the rollout was cut, as long as the parameters stay. The features are the output of the last
+    layer; the auxiliary task is that of the recurrent networks.
 
     Args:
         obs_dim: components of an observation.
         action_dim: components of an action.
-        window: k, steps attended over, this one included.
+        window: k, steps that a layer attends over, this one included.
         width: of tokens and features.
         heads: attention heads; divides the width.
-        layers: encoder layers.
+        layers: how many.
         init_std: of the foreseen observation at the start, normalised observation units.
         min_std: its floor.
 
@@ -57,21 +163,17 @@ class TransformerBelief(TensorDictModuleBase):
         min_std: float,
     ) -> None:
         super().__init__()
-        if window < 1 or layers < 1 or heads < 1 or width % heads:
+        if window < 1 or layers < 1 or heads < 1 or width < 1 or width % heads:
             raise ValueError(
-                "`window`, `layers` and `heads` must be at least 1 and heads divide width, got "
-                f"window={window}, layers={layers}, heads={heads}, width={width}."
+                "`window`, `width`, `layers` and `heads` must be at least 1 and heads divide "
+                f"width, got window={window}, width={width}, layers={layers}, heads={heads}."
             )
         self.window, self.width = window, width
-        self.token_dim = 2 * obs_dim + action_dim
-        self.embed = nn.Linear(self.token_dim, width)
-        self.position = nn.Parameter(0.02 * torch.randn(window, width))
-        layer = nn.TransformerEncoderLayer(
-            width, heads, 2 * width, dropout=0.0, batch_first=True, norm_first=True
-        )
-        self.encoder = nn.TransformerEncoder(
-            layer, layers, norm=nn.LayerNorm(width), enable_nested_tensor=False
-        )
+        self.embed = nn.Linear(2 * obs_dim + action_dim, width)
+        self.layers = nn.ModuleList(MemoryLayer(width, heads) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+        # Of layer, head and step, oldest first: the last is the step itself.
+        self.position = nn.Parameter(torch.zeros(layers, heads, window))
         self.foresight = Foresight(width, obs_dim, action_dim, init_std=init_std, min_std=min_std)
         self.in_keys = ["observation", "observed", "previous_action", "is_init", *_STATE]
         self.out_keys = [
@@ -81,10 +183,10 @@ class TransformerBelief(TensorDictModuleBase):
         ]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Make the transform that puts the window into the environment."""
+        """Make the transform that puts the memory into the environment."""
         return TensorDictPrimer(
             {
-                _WINDOW: Unbounded((self.window, self.token_dim)),
+                _MEMORY: Unbounded((len(self.layers), self.window - 1, self.width)),
                 _LENGTH: Unbounded((1,), dtype=torch.int64),
                 _HIDDEN: Unbounded((self.width,)),
             },
@@ -93,7 +195,7 @@ class TransformerBelief(TensorDictModuleBase):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write features, log-likelihood and the next window.
+        """Write features, log-likelihood and the next memory.
 
         Args:
             tensordict: one step of any batch shape, or sequences under recurrent mode.
@@ -109,13 +211,14 @@ class TransformerBelief(TensorDictModuleBase):
         rows, time = batch.numel(), 1
         if recurrent_mode():
             rows, time = batch[:-1].numel(), batch[-1]
-        token = token.reshape(rows, time, self.token_dim)
+        x = self.embed(token.reshape(rows, time, token.shape[-1]))
         is_init = is_init.reshape(rows, time)
 
-        window, length, hidden = self._stored(tensordict, token)
-        tokens = torch.cat([window, token], 1)
-        visible = self._visible(is_init, length)
-        features = self._attend(tokens, visible)
+        memory, length, hidden = self._stored(tensordict, x)
+        step = torch.arange(time, device=x.device)
+        # Where the episode of each step began, counted from the first; the memory lies before it.
+        start = torch.where(is_init, step, -length).cummax(1).values
+        features, memories = self._attend(x, memory, start)
         before = torch.cat([hidden.unsqueeze(1), features[:, :-1]], 1)
         before = torch.where(is_init.unsqueeze(-1), 0.0, before)
 
@@ -123,19 +226,19 @@ class TransformerBelief(TensorDictModuleBase):
         tensordict.set("features", features)
         likelihood = self.foresight(before.reshape(*batch, self.width), tensordict)
         tensordict.set(("belief", "log_likelihood"), likelihood)
-        windows = self._windows(tokens).reshape(*batch, self.window, self.token_dim)
-        tensordict.set(("next", *_WINDOW), windows)
-        tensordict.set(("next", *_LENGTH), visible.sum(-1).reshape(*batch, 1))
+        tensordict.set(("next", *_MEMORY), memories.reshape(*batch, *memories.shape[2:]))
+        length = (step - start + 1).clamp_max(self.window - 1)
+        tensordict.set(("next", *_LENGTH), length.reshape(*batch, 1))
         tensordict.set(("next", *_HIDDEN), features)
         return tensordict
 
-    def _stored(self, tensordict: TensorDictBase, token: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return window, its valid length and hidden state before the first step of each row."""
-        rows, time = token.shape[:2]
+    def _stored(self, tensordict: TensorDictBase, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return memory, its valid length and hidden state before the first step of each row."""
+        rows, time = x.shape[:2]
         zeros = (
-            token.new_zeros(rows, self.window, self.token_dim),
-            torch.zeros(rows, 1, dtype=torch.int64, device=token.device),
-            token.new_zeros(rows, self.width),
+            x.new_zeros(rows, len(self.layers), self.window - 1, self.width),
+            torch.zeros(rows, 1, dtype=torch.int64, device=x.device),
+            x.new_zeros(rows, self.width),
         )
         first = []
         for key, zero in zip(_STATE, zeros, strict=True):
@@ -145,26 +248,35 @@ class TransformerBelief(TensorDictModuleBase):
             )
         return first[0], first[1], first[2]
 
-    def _windows(self, sequence: Tensor) -> Tensor:
-        """Cut (rows, k + time, ...) into the k entries up to each step: (rows, time, k, ...)."""
-        cut = sequence.unfold(1, self.window, 1)[:, 1:]
-        return cut.movedim(-1, 2)
+    def _attend(self, x: Tensor, memory: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+        """Return features (rows, time, width) and the memory after each step.
 
-    def _visible(self, is_init: Tensor, length: Tensor) -> Tensor:
-        """Tell which of the k steps belong to the episode of the newest, (rows, time, k)."""
-        index = torch.arange(self.window, device=is_init.device)
-        valid = torch.cat([index >= self.window - length, torch.ones_like(is_init)], 1)
-        episode = is_init.long().cumsum(1)
-        episode = torch.cat([torch.zeros_like(length).expand(-1, self.window), episode], 1)
-        episodes = self._windows(episode)
-        return self._windows(valid) & (episodes == episodes[..., -1:])
+        Args:
+            x: embedded steps, shape ``(rows, time, width)``.
+            memory: before the first of them, shape ``(rows, layers, k - 1, width)``.
+            start: where the episode of each began, shape ``(rows, time)``.
+        """
+        bias = self._bias(start)
+        remembered = []
+        for i, layer in enumerate(self.layers):
+            x, entries = layer(x, memory[:, i], bias[i])
+            remembered.append(entries.detach())
+        # Views of the last k - 1 entries up to each step: a sequence's are read by nobody.
+        windows = torch.stack(remembered, 1).unfold(2, self.window - 1, 1)[:, :, 1:]
+        return self.norm(x), windows.permute(0, 2, 1, 4, 3)
 
-    def _attend(self, tokens: Tensor, visible: Tensor) -> Tensor:
-        """Return the encoder's output at the newest step of every window, (rows, time, width)."""
-        embedded = self._windows(self.embed(tokens)) + self.position
-        rows, time = embedded.shape[:2]
-        out = self.encoder(embedded.flatten(0, 1), src_key_padding_mask=~visible.flatten(0, 1))
-        return out[:, -1].reshape(rows, time, self.width)
+    def _bias(self, start: Tensor) -> Tensor:
+        """Return what is added to the scores: (layers, rows, time, heads, k - 1 + time)."""
+        time = start.shape[1]
+        count = self.window - 1 + time
+        # Rows of k biases, each a step further right than the one before: repeating them with a
+        # period of one more than a row is long shifts every row by one.
+        padded = nn.functional.pad(self.position, (0, time), value=float("-inf"))
+        band = padded.unsqueeze(-2).expand(-1, -1, time, -1).flatten(2)[..., : time * count]
+        band = band.unflatten(-1, (time, count)).transpose(1, 2).unsqueeze(1)
+        entry = torch.arange(1 - self.window, time, device=start.device)
+        visible = entry >= start.unsqueeze(-1)
+        return torch.where(visible.unsqueeze(-2), band, float("-inf"))
 
 
 def build(
@@ -185,10 +297,10 @@ def build(
         obs_dim: components of an observation.
         action_dim: components of an action.
         normalize: what the likelihood is divided by, ``entry`` or ``step``.
-        window: steps attended over.
+        window: steps that a layer attends over.
         width: of tokens and features.
         heads: attention heads.
-        layers: encoder layers.
+        layers: how many.
         init_std: of the foreseen observation at the start.
         min_std: its floor.
 
