@@ -1,8 +1,8 @@
 """What the recipe's other belief modules do that not all of them do.
 
 The auxiliary likelihood counts what arrived and nothing else; gru_action reads the action and gru
-does not; the transformer's memory ends with its window and with the episode; filling keeps the
-last value. What every belief owes the recipe stands in test_recipe_beliefs.py.
+does not; filling keeps the last value. The transformer has test_transformer_belief.py; what every
+belief owes the recipe stands in test_recipe_beliefs.py.
 """
 
 from __future__ import annotations
@@ -91,25 +91,3 @@ def test_filling_holds_the_last_normalised_value_and_the_mean_before_the_first()
         never += int((held == 0).sum())
     assert never > 0
     assert (data["features"][~seen] != 0).float().mean() > 0.5
-
-
-def test_the_transformer_forgets_what_lies_beyond_its_window():
-    module = make_belief("transformer belief.window=3").module
-    frames = make_frames(2)
-    frames["is_init"][:, 1:] = False
-    changed = frames.clone()
-    changed["observation"][:, 0] += 1.0
-    with set_recurrent_mode(True):
-        before, after = module(frames)["features"], module(changed)["features"]
-    assert not torch.allclose(before[:, :3], after[:, :3])
-    assert torch.allclose(before[:, 3:], after[:, 3:])
-
-
-def test_the_transformer_sees_nothing_of_the_episode_before():
-    module = make_belief("transformer belief.window=6").module
-    frames = make_frames(2)
-    changed = frames.clone()
-    changed["observation"][0, :3] += 1.0  # row 0 starts anew at step 3
-    with set_recurrent_mode(True):
-        before, after = module(frames)["features"], module(changed)["features"]
-    assert torch.allclose(before[0, 3:], after[0, 3:])

@@ -1,7 +1,8 @@
 """Every belief of conf/belief, found on disk: the duties of all, and a run of each.
 
 A new file there is tested here without an edit. What one of them does that others do not stands in
-test_baseline_beliefs.py, test_belief_filter_module.py and test_particle_filter.py.
+test_baseline_beliefs.py, test_transformer_belief.py, test_belief_filter_module.py and
+test_particle_filter.py.
 """
 
 from __future__ import annotations

@@ -1,0 +1,250 @@
+"""What the transformer belief remembers, for how long, and what its attention computes.
+
+Attention is that of `nn.MultiheadAttention`. A layer sees k steps of the episode, no more and no
+less, by their distance and not by where a rollout was cut; the stored memory is its inputs, as far
+as they are valid. That steps equal sequences over whole rollouts stands in test_recipe_beliefs.py.
+"""
+
+from __future__ import annotations
+
+import pytest
+import recipe_tools
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.modules import set_recurrent_mode
+
+OBS, ACTION = 5, 2
+MEMORY, LENGTH = ("recurrent", "memory"), ("recurrent", "length")
+
+
+def make_module(**sizes: int):
+    """Return a transformer in float64, its position bias away from the zeros it starts from."""
+    from assembly.beliefs import build_belief
+
+    settings = recipe_tools.make_config("belief=transformer")["belief"]
+    settings |= {"window": 4, "width": 16, "layers": 1, **sizes}
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        module = build_belief(
+            settings, obs_dim=OBS, action_dim=ACTION, normalize="entry"
+        ).module.double()
+        nn.init.normal_(module.position)
+    return module
+
+
+def make_frames(batch: int, time: int) -> TensorDict:
+    """Return what arrived over some steps of an episode that goes on."""
+    g = torch.Generator().manual_seed(0)
+    return TensorDict(
+        {
+            "observation": torch.randn(batch, time, OBS, generator=g, dtype=torch.float64),
+            "observed": torch.rand(batch, time, OBS, generator=g) < 0.6,
+            "previous_action": torch.randn(batch, time, ACTION, generator=g, dtype=torch.float64),
+            "is_init": torch.zeros(batch, time, 1, dtype=torch.bool),
+        },
+        [batch, time],
+    )
+
+
+def reach(module, frames: TensorDict) -> Tensor:
+    """Return whether the features of a step (row) move with what arrived at another (column)."""
+    frames = frames.clone()
+    observation = frames["observation"].requires_grad_()
+    with set_recurrent_mode(True):
+        features = module(frames)["features"]
+    weights = torch.linspace(1, 2, features.shape[-1], dtype=torch.float64)
+    rows = [
+        torch.autograd.grad((features[:, t] * weights).sum(), observation, retain_graph=True)[0]
+        for t in range(frames.shape[1])
+    ]
+    return torch.stack([(row != 0).any(-1).any(0) for row in rows])
+
+
+def in_steps(module, frames: TensorDict) -> TensorDict:
+    """Run one step at a time from an empty memory."""
+    carried = TensorDict(
+        {
+            key: spec.expand(frames.shape[0], *spec.shape).zero()
+            for key, spec in module.make_tensordict_primer().primers.items(True, True)
+        }
+    ).to(torch.float64)
+    carried[LENGTH] = carried[LENGTH].long()
+    steps = []
+    for t in range(frames.shape[1]):
+        with torch.no_grad():
+            step = module(frames[:, t].clone().update(carried))
+        carried = step["next"].select(*carried.keys())
+        steps.append(step)
+    return torch.stack(steps, 1)
+
+
+def band(time: int, steps: int) -> Tensor:
+    """Return whether a step (row) comes after another (column), by at most that many steps."""
+    distance = torch.arange(time).unsqueeze(1) - torch.arange(time)
+    return (distance >= 0) & (distance <= steps)
+
+
+# --- attention
+def test_attention_is_that_of_torch_over_what_is_visible():
+    from assembly.beliefs.transformer import MemoryAttention
+
+    rows, time, entries, width, heads = 3, 4, 7, 12, 3
+    torch.manual_seed(0)
+    ours = MemoryAttention(width, heads).double()
+    theirs = nn.MultiheadAttention(width, heads, batch_first=True).double()
+    for parameter in ours.parameters():
+        nn.init.normal_(parameter)
+    with torch.no_grad():
+        weights = [ours.query.weight, ours.key.weight, ours.value.weight]
+        theirs.in_proj_weight.copy_(torch.cat(weights))
+        theirs.in_proj_bias.zero_()[:width].copy_(ours.query.bias)
+        theirs.out_proj.load_state_dict(ours.out.state_dict())
+    x = torch.randn(rows, entries, width, dtype=torch.float64, requires_grad=True)
+    bias = torch.randn(rows, time, heads, entries, dtype=torch.float64)
+    hidden = torch.rand(rows, time, 1, entries) < 0.4
+    hidden[..., -1] = False
+    bias = bias.masked_fill(hidden, float("-inf")).requires_grad_()
+    mask = bias.transpose(1, 2).flatten(0, 1)
+    expected, _ = theirs(x[:, -time:], x, x, attn_mask=mask, need_weights=False)
+    received = ours(x, bias)
+    torch.testing.assert_close(received, expected)
+    gradients = [torch.autograd.grad(out.square().sum(), [x, bias]) for out in (received, expected)]
+    for ours_grad, theirs_grad in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours_grad, theirs_grad)
+
+
+# --- the window
+@pytest.mark.parametrize("window", [1, 2, 4])
+@pytest.mark.parametrize("layers", [1, 2])
+def test_features_depend_on_as_many_steps_as_the_layers_reach_back(window, layers):
+    module = make_module(window=window, layers=layers)
+    expected = band(9, layers * (window - 1))
+    assert torch.equal(reach(module, make_frames(2, 9)), expected)
+
+
+def test_the_window_is_the_same_one_step_at_a_time():
+    module = make_module()
+    frames = make_frames(1, 9)
+    expected = in_steps(module, frames)["features"]
+    for changed in range(9):
+        other = frames.clone()
+        other["observation"][:, changed] += 1.0
+        moved = (in_steps(module, other)["features"] != expected).any(-1)[0]
+        assert torch.equal(moved, band(9, 3)[:, changed])
+
+
+@pytest.mark.parametrize("distance", range(4))
+def test_the_bias_of_a_distance_is_that_of_the_step_so_far_back(distance):
+    module = make_module()
+    with torch.no_grad():
+        module.position.fill_(-1e4)[..., 3 - distance] = 0.0  # oldest first
+    time = torch.arange(9)
+    expected = torch.eye(9, dtype=torch.bool)
+    # The step itself always passes by the attention; earlier ones through it alone.
+    expected[time[distance:], time[: 9 - distance]] = True
+    frames = make_frames(1, 9)
+    # Before so many steps there were, all that is seen has the same bias.
+    assert torch.equal(reach(module, frames)[distance:], expected[distance:])
+    with set_recurrent_mode(True):
+        sequence = module(frames.clone())["features"]
+    torch.testing.assert_close(in_steps(module, frames)["features"], sequence)
+
+
+# --- episodes
+def test_an_episode_start_hides_what_lay_before():
+    module = make_module(layers=2)
+    frames = make_frames(2, 9)
+    frames["is_init"][:, 3] = True
+    expected = band(9, 6)
+    expected[3:, :3] = False
+    assert torch.equal(reach(module, frames), expected)
+
+
+def test_an_episode_start_hides_the_stored_memory():
+    module = make_module(layers=2)
+    stored = in_steps(module, make_frames(3, 5))["next"][:, -1].select(MEMORY, LENGTH)
+    frames = make_frames(3, 6)[:, 5]
+    frames["is_init"][:] = True
+    fresh = module(frames.clone())
+    begun = module(frames.clone().update(stored))
+    assert torch.equal(begun["features"], fresh["features"])
+    assert (begun["next", *LENGTH] == 1).all()
+    frames["is_init"][:] = False
+    gone_on = module(frames.clone().update(stored))
+    assert not torch.isclose(gone_on["features"], fresh["features"]).all(-1).any()
+
+
+# --- the memory
+def test_what_lies_beyond_the_length_of_the_memory_counts_for_nothing():
+    module = make_module(window=6, layers=2)
+    frames = make_frames(2, 4).update(in_steps(module, make_frames(2, 4)).select("recurrent"))
+    assert frames[LENGTH].squeeze(-1).tolist() == [[0, 1, 2, 3]] * 2
+    with torch.no_grad():
+        for recurrent in (False, True):
+            with set_recurrent_mode(recurrent):
+                expected = module(frames.clone())["features"]
+                changed = frames.clone()
+                for length in range(4):
+                    changed[MEMORY][:, length, :, : 5 - length] = 9.0
+                assert torch.equal(module(changed)["features"], expected)
+                changed = frames.clone()
+                changed[MEMORY][:, 3, :, -3] = 9.0
+                changed = changed[:, 3:]
+                assert not torch.equal(module(changed)["features"], expected[:, 3:])
+
+
+def test_sequences_and_steps_write_the_same_memory():
+    module = make_module(layers=2)
+    frames = make_frames(2, 9)
+    frames["is_init"][0, 4] = True
+    steps = in_steps(module, frames)
+    with set_recurrent_mode(True):
+        sequence = module(frames.clone())
+    length = [[1, 2, 3, 3, 1, 2, 3, 3, 3], [1, 2, 3, 3, 3, 3, 3, 3, 3]]
+    assert sequence["next", *LENGTH].squeeze(-1).tolist() == length
+    assert torch.equal(steps["next", *LENGTH], sequence["next", *LENGTH])
+    assert sequence["next", *MEMORY].shape == (2, 9, 2, 3, 16)
+    torch.testing.assert_close(sequence["next", *MEMORY], steps["next", *MEMORY])
+
+
+def test_no_gradient_flows_into_the_memory():
+    module = make_module()
+    frames = make_frames(2, 3)
+    for recurrent in (False, True):
+        with set_recurrent_mode(recurrent):
+            out = module(frames.clone())
+        assert out["features"].requires_grad
+        assert not out["next", *MEMORY].requires_grad
+
+
+def test_it_learns_to_repeat_what_arrived_some_steps_ago():
+    module = make_module(window=5, layers=1)
+    head = nn.Linear(16, 1, dtype=torch.float64)
+    optimizer = torch.optim.Adam([*module.parameters(), *head.parameters()], 1e-2)
+    g = torch.Generator().manual_seed(0)
+    losses = []
+    for _ in range(250):
+        frames = make_frames(16, 12)
+        frames["observation"] = torch.randn(16, 12, OBS, generator=g, dtype=torch.float64)
+        with set_recurrent_mode(True):
+            out = head(module(frames)["features"]).squeeze(-1)
+        loss = (out[:, 4:] - frames["observation"][:, 1:-3, 0]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    # The variance of what is to be repeated is 1.
+    assert losses[0] > 0.8
+    assert sum(losses[-20:]) / 20 < 0.1
+
+
+# --- sizes
+@pytest.mark.parametrize(
+    "sizes", [{"window": 0}, {"layers": 0}, {"heads": 0}, {"width": 0}, {"heads": 3}]
+)
+def test_sizes_that_do_not_fit_are_named(sizes):
+    from assembly.errors import UserError
+
+    with pytest.raises(UserError, match="`belief=transformer`: `window`, `width`, `layers` and"):
+        make_module(**sizes)
