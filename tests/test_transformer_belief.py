@@ -19,18 +19,15 @@ MEMORY, LENGTH = ("recurrent", "memory"), ("recurrent", "length")
 
 
 def make_module(**sizes: int):
-    """Return a transformer in float64, its position bias away from the zeros it starts from."""
+    """Return a transformer in float64."""
     from assembly.beliefs import build_belief
 
     settings = recipe_tools.make_config("belief=transformer")["belief"]
     settings |= {"window": 4, "width": 16, "layers": 1, **sizes}
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        module = build_belief(
-            settings, obs_dim=OBS, action_dim=ACTION, normalize="entry"
-        ).module.double()
-        nn.init.normal_(module.position)
-    return module
+        belief = build_belief(settings, obs_dim=OBS, action_dim=ACTION, normalize="entry")
+    return belief.module.double()
 
 
 def make_frames(batch: int, time: int) -> TensorDict:
@@ -86,12 +83,13 @@ def band(time: int, steps: int) -> Tensor:
 
 
 # --- attention
-def test_attention_is_that_of_torch_over_what_is_visible():
+def test_attention_is_that_of_torch_with_positions_added_to_the_keys():
     from assembly.beliefs.transformer import MemoryAttention
 
-    rows, time, entries, width, heads = 3, 4, 7, 12, 3
+    rows, time, window, width, heads = 3, 4, 5, 12, 3
+    entries = window - 1 + time
     torch.manual_seed(0)
-    ours = MemoryAttention(width, heads).double()
+    ours = MemoryAttention(width, heads, window).double()
     theirs = nn.MultiheadAttention(width, heads, batch_first=True).double()
     for parameter in ours.parameters():
         nn.init.normal_(parameter)
@@ -101,15 +99,23 @@ def test_attention_is_that_of_torch_over_what_is_visible():
         theirs.in_proj_bias.zero_()[:width].copy_(ours.query.bias)
         theirs.out_proj.load_state_dict(ours.out.state_dict())
     x = torch.randn(rows, entries, width, dtype=torch.float64, requires_grad=True)
-    bias = torch.randn(rows, time, heads, entries, dtype=torch.float64)
-    hidden = torch.rand(rows, time, 1, entries) < 0.4
-    hidden[..., -1] = False
-    bias = bias.masked_fill(hidden, float("-inf")).requires_grad_()
-    mask = bias.transpose(1, 2).flatten(0, 1)
-    expected, _ = theirs(x[:, -time:], x, x, attn_mask=mask, need_weights=False)
-    received = ours(x, bias)
+    visible = torch.rand(rows, time, entries) < 0.7
+    visible[:, range(time), range(window - 1, entries)] = True
+    # Step by step, with a window of its own each.
+    expected = torch.zeros(rows, time, width, dtype=torch.float64)
+    for t in range(time):
+        seen = x[:, t : t + window]
+        mask = torch.zeros(rows, window, dtype=torch.float64)
+        mask = mask.masked_fill(~visible[:, t, t : t + window], float("-inf"))
+        mask = mask.repeat_interleave(heads, 0).unsqueeze(1)
+        key = seen + ours.position
+        out, _ = theirs(seen[:, -1:], key, seen, attn_mask=mask, need_weights=False)
+        expected[:, t] = out[:, 0]
+    received = ours(x, visible)
     torch.testing.assert_close(received, expected)
-    gradients = [torch.autograd.grad(out.square().sum(), [x, bias]) for out in (received, expected)]
+    gradients = [
+        torch.autograd.grad(out.square().sum(), [x, ours.position]) for out in (received, expected)
+    ]
     for ours_grad, theirs_grad in zip(*gradients, strict=True):
         torch.testing.assert_close(ours_grad, theirs_grad)
 
@@ -135,16 +141,23 @@ def test_the_window_is_the_same_one_step_at_a_time():
 
 
 @pytest.mark.parametrize("distance", range(4))
-def test_the_bias_of_a_distance_is_that_of_the_step_so_far_back(distance):
+def test_the_position_of_a_distance_is_that_of_the_step_so_far_back(distance):
     module = make_module()
+    attention = module.layers[0].attention
     with torch.no_grad():
-        module.position.fill_(-1e4)[..., 3 - distance] = 0.0  # oldest first
+        attention.query.weight.zero_()
+        nn.init.normal_(attention.query.bias)
+        # What every head, asking the same always, turns away from.
+        asked = attention.query.bias.reshape(4, 1, 4) @ attention.key.weight.reshape(4, 4, 16)
+        away = torch.linalg.pinv(asked.squeeze(1)) @ torch.full((4,), -1e6, dtype=torch.float64)
+        attention.position.copy_(away)
+        attention.position[3 - distance] = 0.0  # oldest first
     time = torch.arange(9)
     expected = torch.eye(9, dtype=torch.bool)
     # The step itself always passes by the attention; earlier ones through it alone.
     expected[time[distance:], time[: 9 - distance]] = True
     frames = make_frames(1, 9)
-    # Before so many steps there were, all that is seen has the same bias.
+    # Before there were so many steps, all that is seen has the same position.
     assert torch.equal(reach(module, frames)[distance:], expected[distance:])
     with set_recurrent_mode(True):
         sequence = module(frames.clone())["features"]

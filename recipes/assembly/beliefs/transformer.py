@@ -24,63 +24,89 @@ _STATE = (_MEMORY, _LENGTH, _HIDDEN)
 
 
 class MemoryAttention(nn.Module):
-    r"""Multi-head attention of some steps over themselves and the steps before them.
+    r"""Multi-head attention of some steps over themselves and the k - 1 steps before each.
 
-    For each head with head dimension d, a query x, keys and values m_j, and a bias b_j:
+    For each head of dimension d, a query x and the entries m_j at distance j:
 
     .. math::
-        p = \mathrm{softmax}_j\big((W_q x + c)^\top W_k m_j / \sqrt d + b_j\big), \qquad
+        p = \mathrm{softmax}_j\big((W_q x + c)^\top W_k (m_j + r_j) / \sqrt d\big), \qquad
         y = \sum_{heads} W_o W_v \sum_j p_j m_j + e
 
-    What ``nn.MultiheadAttention`` computes, in another order: W_k is applied to the query and W_v
-    to the average, so that no step of the memory is projected again. A bias of the keys shifts all
-    scores alike and one of the values adds to e: there is neither.
+    with a learned r_j in the place of Transformer-XL's projected sinusoids. With r = 0 it is what
+    ``nn.MultiheadAttention`` computes, in another order: W_k is applied to the query and W_v to
+    the average, so that no entry is projected again. A bias of the keys would shift all scores
+    alike and one of the values add to e: there is neither.
 
     Args:
         width: of the steps.
         heads: attention heads; divides the width.
+        window: k, steps that a step attends over, itself included.
     """
 
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int, heads: int, window: int) -> None:
         super().__init__()
-        self.heads, self.head_dim = heads, width // heads
+        self.split = (heads, width // heads, width)
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(width, width, bias=False)
         self.value = nn.Linear(width, width, bias=False)
         self.out = nn.Linear(width, width)
+        # Oldest first. As large as the normalised entries that they are added to: distances can be
+        # told apart from the start. One bias per distance instead learns this many times slower.
+        self.position = nn.Parameter(torch.randn(window, width))
         for layer in (self.query, self.key, self.value):
             # Where nn.MultiheadAttention starts: the three as one matrix.
             nn.init.xavier_uniform_(layer.weight, gain=0.5**0.5)
         nn.init.zeros_(self.query.bias)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, entries: Tensor, bias: Tensor) -> Tensor:
+    def forward(self, entries: Tensor, visible: Tensor) -> Tensor:
         """Attend from the last steps.
 
         Args:
-            entries: the memory, then the steps, shape ``(rows, entries, width)``.
-            bias: added to the scores, -inf where a step does not see an entry, shape
-                ``(rows, time, heads, entries)``.
+            entries: k - 1 remembered ones, then the steps, shape ``(rows, k - 1 + time, width)``.
+            visible: whether an entry is of the episode of a step, bool, shape
+                ``(rows, time, k - 1 + time)``.
 
         Returns:
             Shape ``(rows, time, width)``.
         """
-        rows, time, heads, count = bias.shape
-        width = entries.shape[-1]
-        split = (heads, self.head_dim, width)
-        query = self.query(entries[:, -time:]).reshape(rows * time, heads, self.head_dim)
-        query = torch.bmm(query.transpose(0, 1), self.key.weight.view(split)).transpose(0, 1)
+        rows, time, count = visible.shape
+        heads, head_dim, width = self.split
+        query = self.query(entries[:, -time:]).reshape(rows * time, heads, head_dim)
+        query = torch.bmm(query.transpose(0, 1), self.key.weight.view(self.split))
+        query = query.view(heads, rows, time, width).transpose(0, 1)
+        query = query.reshape(rows, heads * time, width)
+        bias = nn.functional.linear(query, self.position).view(rows, heads, time, -1)
+        bias = torch.where(visible.unsqueeze(1), shifted(bias), float("-inf"))
+        scale = head_dim**-0.5
         scores = torch.baddbmm(
-            bias.reshape(rows, time * heads, count),
-            query.reshape(rows, time * heads, width),
+            bias.view(rows, heads * time, count),
+            query,
             entries.transpose(1, 2),
-            alpha=self.head_dim**-0.5,
+            beta=scale,
+            alpha=scale,
         )
-        mean = torch.bmm(scores.softmax(-1), entries).reshape(rows * time, heads, width)
-        value = self.value.weight.view(split).transpose(1, 2)
-        value = torch.bmm(mean.transpose(0, 1), value).transpose(0, 1)
-        out: Tensor = self.out(value.reshape(rows, time, width))
+        mean = torch.bmm(scores.softmax(-1), entries).view(rows, heads, time, width)
+        mean = mean.transpose(0, 1).reshape(heads, rows * time, width)
+        value = torch.bmm(mean, self.value.weight.view(self.split).transpose(1, 2))
+        out: Tensor = self.out(value.transpose(0, 1).reshape(rows, time, width))
         return out
+
+
+def shifted(window: Tensor) -> Tensor:
+    """Move what each step holds of its window to where the window lies.
+
+    Args:
+        window: of every step, oldest first, shape ``(*, time, k)``.
+
+    Returns:
+        Shape ``(*, time, k - 1 + time)``: row t holds its k values from entry t on, -inf elsewhere.
+    """
+    time, size = window.shape[-2:]
+    count = size - 1 + time
+    # Read with rows of `count`, rows of one more begin one further right each time.
+    padded = nn.functional.pad(window, (0, time), value=float("-inf"))
+    return padded.flatten(-2)[..., : time * count].unflatten(-1, (time, count))
 
 
 class MemoryLayer(nn.Module):
@@ -89,14 +115,15 @@ class MemoryLayer(nn.Module):
     Args:
         width: of the steps.
         heads: attention heads; divides the width.
+        window: k, steps that a step attends over, itself included.
     """
 
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int, heads: int, window: int) -> None:
         super().__init__()
         # Without a scale of its own: those of the projections do it, and what is remembered
         # depends on the layers below alone.
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
-        self.attention = MemoryAttention(width, heads)
+        self.attention = MemoryAttention(width, heads, window)
         self.feedforward = nn.Sequential(
             nn.LayerNorm(width),
             nn.Linear(width, 2 * width),
@@ -104,20 +131,20 @@ class MemoryLayer(nn.Module):
             nn.Linear(2 * width, width),
         )
 
-    def forward(self, x: Tensor, memory: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, memory: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
         """Take some steps through the layer.
 
         Args:
             x: the steps, shape ``(rows, time, width)``.
-            memory: normalised inputs of the layer at the steps before, oldest first, shape
-                ``(rows, remembered, width)``.
-            bias: see :class:`MemoryAttention`.
+            memory: normalised inputs of the layer at the k - 1 steps before, oldest first, shape
+                ``(rows, k - 1, width)``.
+            visible: see :class:`MemoryAttention`.
 
         Returns:
             The steps' outputs, and the memory with their normalised inputs after it.
         """
         entries = torch.cat([memory, self.norm(x)], 1)
-        x = x + self.attention(entries, bias)
+        x = x + self.attention(entries, visible)
         return x + self.feedforward(x), entries
 
 
@@ -127,8 +154,7 @@ class TransformerBelief(TensorDictModuleBase):
     A causal transformer with a memory, as Transformer-XL [Dai et al. 2019] and, for reinforcement
     learning, GTrXL [Parisotto et al. 2020]: a step passes through the layers once, and each layer
     attends over the step and its own inputs at the k - 1 steps before it in the same episode. With
-    several layers the features so depend on the last ``layers * (k - 1) + 1`` steps. A learned
-    bias per head and distance tells the steps apart.
+    several layers the features so depend on the last ``layers * (k - 1) + 1`` steps.
 
     The recurrent state is the memory: normalised inputs of every layer, half of what keys and
     values would take, and what the current weights make keys and values of. No gradient flows
@@ -170,10 +196,8 @@ class TransformerBelief(TensorDictModuleBase):
             )
         self.window, self.width = window, width
         self.embed = nn.Linear(2 * obs_dim + action_dim, width)
-        self.layers = nn.ModuleList(MemoryLayer(width, heads) for _ in range(layers))
+        self.layers = nn.ModuleList(MemoryLayer(width, heads, window) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        # Of layer, head and step, oldest first: the last is the step itself.
-        self.position = nn.Parameter(torch.zeros(layers, heads, window))
         self.foresight = Foresight(width, obs_dim, action_dim, init_std=init_std, min_std=min_std)
         self.in_keys = ["observation", "observed", "previous_action", "is_init", *_STATE]
         self.out_keys = [
@@ -256,27 +280,16 @@ class TransformerBelief(TensorDictModuleBase):
             memory: before the first of them, shape ``(rows, layers, k - 1, width)``.
             start: where the episode of each began, shape ``(rows, time)``.
         """
-        bias = self._bias(start)
+        # The entries by the step they belong to; which are outside the window the layers know.
+        entry = torch.arange(1 - self.window, x.shape[1], device=x.device)
+        visible = entry >= start.unsqueeze(-1)
         remembered = []
         for i, layer in enumerate(self.layers):
-            x, entries = layer(x, memory[:, i], bias[i])
+            x, entries = layer(x, memory[:, i], visible)
             remembered.append(entries.detach())
         # Views of the last k - 1 entries up to each step: a sequence's are read by nobody.
         windows = torch.stack(remembered, 1).unfold(2, self.window - 1, 1)[:, :, 1:]
         return self.norm(x), windows.permute(0, 2, 1, 4, 3)
-
-    def _bias(self, start: Tensor) -> Tensor:
-        """Return what is added to the scores: (layers, rows, time, heads, k - 1 + time)."""
-        time = start.shape[1]
-        count = self.window - 1 + time
-        # Rows of k biases, each a step further right than the one before: repeating them with a
-        # period of one more than a row is long shifts every row by one.
-        padded = nn.functional.pad(self.position, (0, time), value=float("-inf"))
-        band = padded.unsqueeze(-2).expand(-1, -1, time, -1).flatten(2)[..., : time * count]
-        band = band.unflatten(-1, (time, count)).transpose(1, 2).unsqueeze(1)
-        entry = torch.arange(1 - self.window, time, device=start.device)
-        visible = entry >= start.unsqueeze(-1)
-        return torch.where(visible.unsqueeze(-2), band, float("-inf"))
 
 
 def build(
