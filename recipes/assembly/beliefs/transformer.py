@@ -106,7 +106,7 @@ def shifted(window: Tensor) -> Tensor:
     count = size - 1 + time
     # Read with rows of `count`, rows of one more begin one further right each time.
     padded = nn.functional.pad(window, (0, time), value=float("-inf"))
-    return padded.flatten(-2)[..., : time * count].unflatten(-1, (time, count))
+    return padded.flatten(-2)[..., : time * count].view(*window.shape[:-1], count)
 
 
 class MemoryLayer(nn.Module):
