@@ -14,7 +14,10 @@ from assembly.report_runs import StudyRun, grouped, point_kind, point_order
 from assembly.report_statistics import Array, interquartile_mean, interval
 from assembly.report_tables import final_evaluation, training_rows
 
-_COLOURS = ("#1f6fb4", "#d1622b", "#3a923a", "#8d5aa8", "#7f6a4f", "#c44e7f", "#5f6b73")
+_COLOURS = (
+    *("#1f6fb4", "#d1622b", "#3a923a", "#8d5aa8", "#7f6a4f", "#c44e7f", "#5f6b73"),
+    *("#b59b00", "#17a2a2", "#222222"),
+)
 _PANEL = (4.3, 3.1)  # inches
 _COLUMNS = 3
 _GRID = 200  # points of a curve
@@ -43,12 +46,12 @@ def learning_curves(runs: Sequence[StudyRun], rows: int) -> Figure:
         panel holds one method only, also every seed, and the evaluations as markers.
     """
     with mpl.rc_context(STYLE):
-        tasks = list(dict.fromkeys(run.group["task"] for run in runs))
+        tasks = list(dict.fromkeys(_panel(run) for run in runs))
         lines = -(-len(tasks) // _COLUMNS)
         figure, axes = _panels(lines, min(len(tasks), _COLUMNS))
         colours = _colours(runs)
         for axis, task in zip(axes.ravel(), tasks, strict=False):
-            groups = [g for g in grouped(runs) if g[0].group["task"] == task]
+            groups = [g for g in grouped(runs) if _panel(g[0]) == task]
             for members in groups:
                 label = _label(members, runs)
                 _draw_curves(axis, members, rows, colours[label], label, alone=len(groups) == 1)
@@ -76,7 +79,7 @@ def robustness(runs: Sequence[StudyRun], mode: str = "sampled") -> Figure | None
     """
     with mpl.rc_context(STYLE):
         series = {
-            (members[0].group["task"], kind, _label(members, runs)): (members, points)
+            (_panel(members[0]), kind, _label(members, runs)): (members, points)
             for members in grouped(runs)
             for kind, points in _series(members, mode)
         }
@@ -107,6 +110,12 @@ def robustness(runs: Sequence[StudyRun], mode: str = "sampled") -> Figure | None
             axis.set_ylabel(f"raw return, {mode} actions")
         _legend(figure, axes)
     return figure
+
+
+def _panel(run: StudyRun) -> str:
+    """Return what a panel shows: a task, and a choice where the study has a further axis."""
+    group = run.group
+    return f"{group['task']}, {group['variant']}" if group["variant"] else group["task"]
 
 
 def _panels(lines: int, columns: int) -> tuple[Figure, Any]:

@@ -10,9 +10,10 @@ import numpy as np
 
 from assembly.report_commands import commands_from_nothing, rebuild_command
 from assembly.report_paper import THRESHOLDS, task_family
-from assembly.report_runs import Row, StudyRun, grouped
+from assembly.report_runs import Row, StudyRun, grouped, trained_on
 from assembly.report_statistics import interquartile_mean
 from assembly.report_tables import KEPT, format_number
+from assembly.report_variants import mark_best, variant_lines, variant_order
 
 _TRAINING_COLUMNS = (
     ("return", "training return"),
@@ -61,6 +62,7 @@ def study_page(
     parts = [f"# {title}", notes.strip(), _unfinished(runs)]
     parts += [f"![{FIGURE_TEXTS[figure]}]({figure})" for figure in figures]
     parts += ["## Training", _TRAINING_TEXT, _training_table(runs, tables.summary)]
+    parts += _variant_table(runs, tables.summary)
     evaluated = _evaluation_tables(tables.summary)
     if evaluated:
         parts += ["## Evaluation of the last checkpoint", _EVALUATION_TEXT, *evaluated]
@@ -97,6 +99,11 @@ _TRAINING_TEXT = (
     "ratio: realised share over all components, mean over the whole run. Log-likelihood: nats per "
     "observed entry, normalised units, mean of the last tenth of the run. Steps/s: whole training "
     "loop, start-up and evaluation excluded, on whatever else the machine was doing."
+)
+_VARIANT_TEXT = (
+    "Return in training: raw, sampled actions, mean of the last 100 episodes; interquartile mean "
+    "over seeds [95 % interval]. **Bold**: the best of its line, among the runs that have come to "
+    "their end. A cell that was not run is empty."
 )
 _EVALUATION_TEXT = (
     "Mean raw return of the episodes of a seed; **interquartile mean** over seeds [95 % bootstrap "
@@ -145,10 +152,48 @@ def _training_table(runs: Sequence[StudyRun], summary: Sequence[Row]) -> str:
         cells = [_with_seeds(first), *(_number(row["mean"]) for row in others)]
         seeds = ", ".join(str(run.settings.seed) for run in members)
         rows.append(
-            [group["task"], f"`{group['method']}`", _trained_on(group), seeds, steps, *cells]
+            [group["task"], f"`{group['method']}`", trained_on(group), seeds, steps, *cells]
         )
     head = ["task", "method", "trained on", "seeds", "steps", *(n for n, _ in _TRAINING_COLUMNS)]
     return _table(head, rows)
+
+
+def _variant_table(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[str]:
+    """Return a heading and a table over the axes beside task, method and seed, where there are."""
+    returns = [row for row in summary if row["quantity"] == "training return"]
+    variants = sorted({row["variant"] for row in returns}, key=variant_order)
+    if len(variants) < 2:
+        return []
+    groups = []
+    for members in grouped(runs):
+        (found,) = (row for row in returns if _belongs(row, members[0].group))
+        finished = all(run.finished for run in members)
+        groups.append(found | {"members": members, "finished": finished})
+    lines = variant_lines(groups)
+    rows = []
+    for key, by_variant in lines.items():
+        task, method, *corruption = key
+        cells = [by_variant[v] for v in variants if v in by_variant]
+        best = dict(zip((cell["variant"] for cell in cells), mark_best(cells), strict=True))
+        steps = max(run.frames for cell in cells for run in cell["members"])
+        seeds = sorted({run.settings.seed for cell in cells for run in cell["members"]})
+        texts = [_variant_cell(by_variant[v], best[v]) if v in by_variant else "" for v in variants]
+        head = [task, f"`{method}`", *corruption, ", ".join(map(str, seeds)), f"{steps:,}"]
+        rows.append([*head, *texts])
+    axes = " and ".join(dict.fromkeys(axis for run in runs for axis in run.axes))
+    corrupted = ["trained on"] * (max(map(len, lines)) - 2)
+    names = [f"`{variant}`" if variant else "none" for variant in variants]
+    head = ["task", "method", *corrupted, "seeds", "steps", *names]
+    return [f"## By {axes}", _VARIANT_TEXT, _table(head, rows)]
+
+
+def _variant_cell(row: Row, best: bool) -> str:
+    text = _number(row["iqm"]) or "none"
+    if row["low"] is not None:
+        text = f"{text} [{_number(row['low'])}, {_number(row['high'])}]"
+    if not row["finished"]:
+        return f"{text} at {min(run.frames for run in row['members']):,} steps"
+    return f"**{text}**" if best else text
 
 
 def _evaluation_tables(summary: Sequence[Row]) -> list[str]:
@@ -156,11 +201,11 @@ def _evaluation_tables(summary: Sequence[Row]) -> list[str]:
     tables: dict[tuple[str, str, str], dict[str, dict[str, dict[str, Row]]]] = {}
     for row in summary:
         if row["quantity"].startswith("evaluation"):
-            table = tables.setdefault((row["task"], _trained_on(row), row["mode"]), {})
+            table = tables.setdefault((row["task"], trained_on(row), row["mode"]), {})
             line = table.setdefault(row["point"], {})
             line.setdefault(row["method"], {})[row["quantity"]] = row
     parts = []
-    for (task, trained_on, mode), table in tables.items():
+    for (task, trained, mode), table in tables.items():
         methods = list(dict.fromkeys(method for line in table.values() for method in line))
         rows = []
         for point, line in table.items():
@@ -168,7 +213,7 @@ def _evaluation_tables(summary: Sequence[Row]) -> list[str]:
             known = [ratio for ratio in ratios if ratio is not None]
             ratio = _number(sum(known) / len(known)) if known else ""
             rows.append([point, ratio, *(_evaluated(line.get(method, {})) for method in methods)])
-        parts.append(f"### {task}, trained on {trained_on}, {_MODES[mode]}")
+        parts.append(f"### {task}, trained on {trained}, {_MODES[mode]}")
         head = ["evaluated on", "missing ratio", *(f"`{method}`" for method in methods)]
         parts.append(_table(head, rows))
     return parts
@@ -212,7 +257,8 @@ def _margin_table(margins: Sequence[Row]) -> str:
 def _efficiency_table(efficiency: Sequence[Row]) -> str:
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in efficiency:
-        groups.setdefault((row["task"], row["method"]), []).append(row)
+        method = f"`{row['method']}`" + (f", {row['variant']}" if row["variant"] else "")
+        groups.setdefault((row["task"], method), []).append(row)
     rows = []
     for (task, method), members in groups.items():
         threshold = THRESHOLDS.get(task_family(task))
@@ -225,7 +271,7 @@ def _efficiency_table(efficiency: Sequence[Row]) -> str:
         rows.append(
             [
                 task,
-                f"`{method}`",
+                method,
                 ", ".join(str(row["seed"]) for row in members),
                 _top(members),
                 "" if threshold is None else f"{threshold:g}",
@@ -285,10 +331,6 @@ def _belongs(row: Row, group: Row) -> bool:
     return all(row[key] == value for key, value in group.items())
 
 
-def _trained_on(group: Row) -> str:
-    return f"{group['trained_on']}, sigma {group['noise_sigma']:g}"
-
-
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -315,11 +357,14 @@ def csv_cells(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Return rows with every cell as text, numbers in one fixed form.
 
     Args:
-        rows: of a table; ``values`` is left out, its numbers stand in other columns.
+        rows: of a table; ``values`` is left out, its numbers stand in other columns, and
+            ``variant`` where no row has one.
 
     Returns:
         The rows to write.
     """
+    left_out = {"values"} if any(row.get("variant") for row in rows) else {"values", "variant"}
     return [
-        {key: format_number(value) for key, value in row.items() if key != "values"} for row in rows
+        {key: format_number(value) for key, value in row.items() if key not in left_out}
+        for row in rows
     ]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from assembly.report_runs import Row, StudyRun, grouped
+from assembly.report_runs import Row, StudyRun, grouped, trained_on
 from assembly.report_statistics import interquartile_mean, interval, ratio_of_means
 
 # Returns that an agent shall reach on complete, exact observations, v4, within 2M steps.
@@ -82,8 +82,8 @@ def efficiency_rows(runs: Sequence[StudyRun]) -> list[Row]:
         runs: of a study; those with missing entries or noise are left out.
 
     Returns:
-        Rows ``task, method, frames, seed, top_10_return, threshold, steps_to_threshold``; an empty
-        last cell: not reached.
+        Rows ``task, method, variant, seed, frames, top_10_return, threshold,
+        steps_to_threshold``; an empty last cell: not reached.
     """
     rows = []
     for run in runs:
@@ -94,6 +94,7 @@ def efficiency_rows(runs: Sequence[StudyRun]) -> list[Row]:
             {
                 "task": run.group["task"],
                 "method": run.group["method"],
+                "variant": run.group["variant"],
                 "seed": run.settings.seed,
                 "frames": run.frames,
                 "top_10_return": top_return(run),
@@ -157,7 +158,7 @@ def aggregate_rows(summary: Sequence[Row]) -> list[Row]:
             scores = [value / threshold for value in row["values"]]
             by_method.setdefault(row["method"], {})[task] = scores
     rows = []
-    for (trained_on, point, mode), by_method in found.items():
+    for (trained, point, mode), by_method in found.items():
         tasks = sorted({task for by_task in by_method.values() for task in by_task})
         for method, by_task in by_method.items():
             if len(tasks) < 2 or len(by_task) < len(tasks):
@@ -166,7 +167,7 @@ def aggregate_rows(summary: Sequence[Row]) -> list[Row]:
             ends = interval(strata)
             rows.append(
                 {
-                    "trained_on": trained_on,
+                    "trained_on": trained,
                     "point": point,
                     "mode": mode,
                     "method": method,
@@ -188,7 +189,7 @@ def _half_missing(point: str) -> bool:
 def _place(row: Row) -> tuple[str, str, str, str]:
     return (
         row["task"],
-        f"{row['trained_on']}, sigma {row['noise_sigma']:g}",
+        trained_on(row),
         row["point"],
         row["mode"],
     )
@@ -196,12 +197,12 @@ def _place(row: Row) -> tuple[str, str, str, str]:
 
 def _margin(place: Sequence[str], other: str, values: list[float], against: list[float]) -> Row:
     ends = interval([values, against], ratio_of_means)
-    task, trained_on, point, mode = place
+    task, trained, point, mode = place
     paper = MARGINS_OVER_DVRL.get(task_family(task)) if other == "dvrl" else None
     ratio = interquartile_mean(np.array(values)) / interquartile_mean(np.array(against))
     return {
         "task": task,
-        "trained_on": trained_on,
+        "trained_on": trained,
         "point": point,
         "mode": mode,
         "over": other,

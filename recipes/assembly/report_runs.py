@@ -9,11 +9,12 @@ import math
 import os
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from assembly.errors import UserError
+from assembly.report_variants import further_choices, variant_order
 from assembly.run_folder import CELL_FILE, read_config
 from assembly.settings import Settings, missingness_name, read_settings
 
@@ -36,6 +37,7 @@ class StudyRun:
         evaluations: rows of :func:`_evaluations`.
         study: the study of recipes/study.py that it is a cell of; None: it was run by itself.
         method: what the study calls it; the belief module's name where it was run by itself.
+        axes: its choices on axes of the study beside task, method and seed.
     """
 
     name: str
@@ -47,6 +49,7 @@ class StudyRun:
     evaluations: list[Row]
     study: str | None
     method: str
+    axes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -69,6 +72,7 @@ class StudyRun:
             "method": self.method,
             "trained_on": missingness_name(s.missingness),
             "noise_sigma": s.noise.sigma,
+            "variant": ", ".join(self.axes.values()),
         }
 
     @property
@@ -122,7 +126,7 @@ def read_study(folders: Sequence[Path], *, unfinished: bool = False) -> list[Stu
         unfinished: whether runs that have not come to their end are taken.
 
     Returns:
-        The runs, sorted by task, method, training corruption, seed.
+        The runs, sorted by task, method, training corruption, other choices, seed.
 
     Raises:
         UserError: if a folder can't be read, a run is not finished, or runs of one mean differ
@@ -136,10 +140,15 @@ def read_study(folders: Sequence[Path], *, unfinished: bool = False) -> list[Stu
                 f"`{run.name}` has {run.frames:,} of {run.settings.total_frames:,} steps or lacks "
                 "its final evaluation: finish it with resume=<folder>, or pass unfinished=true."
             )
-    runs.sort(key=lambda run: (*run.group.values(), run.settings.seed, run.name))
+    runs.sort(key=_order)
     for members in grouped(runs):
         _check_group(members)
     return runs
+
+
+def _order(run: StudyRun) -> tuple[Any, ...]:
+    *others, variant = run.group.values()
+    return (*others, variant_order(variant), run.settings.seed, run.name)
 
 
 def grouped(runs: Sequence[StudyRun]) -> list[list[StudyRun]]:
@@ -155,6 +164,19 @@ def grouped(runs: Sequence[StudyRun]) -> list[list[StudyRun]]:
     for run in runs:
         groups.setdefault(tuple(run.group.values()), []).append(run)
     return list(groups.values())
+
+
+def trained_on(row: Row) -> str:
+    """Say in words what the runs of a mean were trained on, and by which other choices.
+
+    Args:
+        row: with the columns of :attr:`StudyRun.group`.
+
+    Returns:
+        Such as ``mar:0.5, sigma 1`` or ``mar:0.5, sigma 1, lr1e-3``.
+    """
+    text = f"{row['trained_on']}, sigma {row['noise_sigma']:g}"
+    return f"{text}, {row['variant']}" if row["variant"] else text
 
 
 def _check_group(members: Sequence[StudyRun]) -> None:
@@ -222,6 +244,7 @@ def _read_run(folder: Path, name: str) -> StudyRun:
         _evaluations(folder, settings),
         study,
         method or _method(settings),
+        further_choices(folder),
     )
 
 

@@ -94,10 +94,10 @@ def summary_rows(runs: Sequence[StudyRun]) -> list[Row]:
         runs: of a study.
 
     Returns:
-        Rows ``task, method, trained_on, noise_sigma, quantity, point, mode, seeds, mean, std, iqm,
-        low, high, per_seed``: std between seeds, interquartile mean and the ends of its 95 %
-        interval, empty for one seed; per_seed ``seed=number`` joined by spaces. ``values``, the
-        same as numbers, is empty where a seed has none, and is no column of summary.csv.
+        Rows ``task, method, trained_on, noise_sigma, variant, quantity, point, mode, seeds, mean,
+        std, iqm, low, high, per_seed``: std between seeds, interquartile mean and the ends of its
+        95 % interval, empty for one seed; per_seed ``seed=number`` joined by spaces. ``values``,
+        the same as numbers, is empty where a seed has none, and is no column of summary.csv.
     """
     rows = []
     for members in grouped(runs):
