@@ -26,7 +26,7 @@ from assembly.report_index import index_page, studies_of
 from assembly.report_options import OPTIONS_FILE, Options, read_options
 from assembly.report_page import Tables, csv_cells, study_page
 from assembly.report_paper import aggregate_rows, efficiency_rows, margin_rows
-from assembly.report_runs import find_folders, read_study
+from assembly.report_runs import find_folders, read_study, without_rollout
 from assembly.report_tables import evaluation_rows, summary_rows, training_rows
 from assembly.run_folder import write_table, write_whole
 from omegaconf import DictConfig
@@ -84,7 +84,12 @@ def _write_index(folder: Path) -> int:
 
 
 def _write_study(wanted: Any, out: Path, options: Options) -> None:
-    runs = read_study(find_folders(wanted), unfinished=options.unfinished)
+    folders = find_folders(wanted)
+    waiting = without_rollout(folders) if options.unfinished else []
+    begun = [folder for folder in folders if folder not in waiting]
+    if not begun:
+        raise UserError(f"`run` must name runs with a finished rollout, {len(waiting)} have none.")
+    runs = read_study(begun, unfinished=options.unfinished)
     out.parent.mkdir(parents=True, exist_ok=True)
     # Everything is made beside the study first: an error leaves the old one as it was.
     work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
@@ -123,6 +128,7 @@ def _write_study(wanted: Any, out: Path, options: Options) -> None:
             notes=_notes(out),
             name=name,
             options=options.words(),
+            waiting=[folder.name for folder in waiting],
         )
         write_whole(work / "README.md", page)
         write_whole(work / OPTIONS_FILE, options.text())

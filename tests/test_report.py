@@ -27,15 +27,10 @@ from recipe_tools import ROOT, make_config  # isort: skip
 
 from assembly.errors import UserError
 from assembly.report_commands import training_command
+from assembly.report_evaluations import point_kind, point_order
+from assembly.report_index import index_page, studies_of
 from assembly.report_paper import steps_to_threshold, top_return
-from assembly.report_runs import (
-    StudyRun,
-    find_folders,
-    flat,
-    point_kind,
-    point_order,
-    read_study,
-)
+from assembly.report_runs import StudyRun, find_folders, flat, read_study
 from assembly.report_statistics import interquartile_mean, interval
 from assembly.report_tables import format_number
 from assembly.run import EVALUATION_COLUMNS
@@ -286,9 +281,33 @@ def test_margins_over_other_methods_stand_beside_those_of_the_paper(tmp_path: Pa
     # 240 / 110 and 260 / 90 are the extremes of 16 resamples.
     assert 240 / 110 - 1 <= float(rows[0]["low"]) < 1.5 < float(rows[0]["high"]) <= 260 / 90 - 1
     page = (tmp_path / "out" / "README.md").read_text()
-    assert "| mar:0.5 | sampled actions | `dvrl` | +150 % [+" in page
+    assert "| mar:0.5 | sampled actions | `dvrl` | 400 | +150 % [+" in page
     assert "python recipes/study.py study=grid\n" in page
     assert "python recipes/report.py 'run=runs/grid/*' out=results/out rows=100\n" in page
+
+
+def test_runs_of_unequal_length_are_compared_at_equal_steps_too(tmp_path: Path) -> None:
+    """The other method was stopped at 200 steps: as long as it ran, drbpn had 20, it had 40."""
+    for seed in (0, 1):
+        folder = make_run(tmp_path / f"d{seed}", method="drbpn", seed=seed, final=80.0)
+        rows = table(folder / "metrics.csv")
+        for row in rows[:2]:
+            row["return"] = "20"
+        write_table(folder / "metrics.csv", rows)
+        name = tmp_path / f"p{seed}"
+        make_run(name, "total_frames=200", frames=[100, 200], method="dvrl", seed=seed, final=40.0)
+        (name / "points.csv").unlink()
+        evaluated = table(name / "evaluation.csv")
+        for row in evaluated:
+            row["kind"] = "final"
+        write_table(name / "evaluation.csv", evaluated[:2])
+    report([tmp_path / n for n in ("d0", "d1", "p0", "p1")], tmp_path / "out")
+    rows = [r for r in table(tmp_path / "out" / "margins.csv") if r["mode"] == "sampled"]
+    found = [(r["point"], r["steps"], r["steps_over"], r["margin"]) for r in rows]
+    assert found == [("mar:0.5", "400", "200", "1"), ("training", "200", "200", "-0.5")]
+    page = (tmp_path / "out" / "README.md").read_text()
+    assert "| `dvrl` | 400 and 200 | +100 % [+100 %, +100 %] | +20 % |" in page
+    assert "| training | sampled actions | `dvrl` | 200 | -50 % [-50 %, -50 %] | +20 % |" in page
 
 
 def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Path) -> None:
@@ -330,6 +349,18 @@ def test_a_threshold_is_reached_by_a_mean_of_a_hundred_episodes(clean_run: Study
     assert steps((1024, 0, None), lucky, (4096, 100, None), bad, good) == 8192
     assert steps(lucky, bad) is None
     assert steps((2_000_001, 900, 2500.0)) is None
+
+
+def test_runs_with_spikes_are_not_complete_and_exact_and_have_a_mean_of_their_own(
+    tmp_path: Path,
+) -> None:
+    spikes = ("noise=spikes", "noise.sigma=0", "noise.spike_probability=0.1", "noise.spike_std=5")
+    make_run(tmp_path / "exact", "experiment=clean", "env.version=v4")
+    make_run(tmp_path / "spiked", "experiment=clean", "env.version=v4", *spikes, final=10.0)
+    report([tmp_path / "exact", tmp_path / "spiked"], tmp_path / "out")
+    assert len(table(tmp_path / "out" / "efficiency.csv")) == 1
+    row = quantity(tmp_path / "out", "training return", trained_on="none:0 spikes:0.1:5")
+    assert row["mean"] == "10"
 
 
 def test_sample_efficiency_is_told_of_clean_runs_and_says_what_was_not_reached(
@@ -447,6 +478,83 @@ def test_points_go_by_the_name_that_the_evaluation_gave_them(tmp_path: Path) -> 
     assert means == {"none:0": "100", "reduction:0.5:model": "80", "reduction:0.5:random": "90"}
 
 
+def episodes(folder: Path, name: str, seed: int, returns: dict[str, list[float]]) -> None:
+    """Write a table of recipes/evaluate.py: returns of episodes by point."""
+    write_table(
+        folder / name,
+        [
+            {"frames": 400, "mechanism": "mcar", "eta": 0.5, "point": point, "mode": "sampled"}
+            | {"episode": i, "return": value, "length": 10, "missing_ratio": 0.5, "seed": seed}
+            for point, values in returns.items()
+            for i, value in enumerate(values)
+        ],
+    )
+
+
+def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path: Path) -> None:
+    """Five episodes of one seed and two of another are neither seven nor five of both."""
+    folder = make_run(tmp_path / "run", points=False)
+    episodes(folder, "points.csv", 99, {"mcar:0.5": [1.0] * 5, "mcar:0.3": [7.0]})
+    episodes(folder, "robustness.csv", 1, {"mcar:0.5": [10.0, 20.0]})
+    report([folder], tmp_path / "out")
+    found = {
+        row["point"]: (row["table"], row["episode_seed"], row["episodes"], row["return_mean"])
+        for row in table(tmp_path / "out" / "evaluation.csv")
+        if row["source"] == "points"
+    }
+    assert found == {
+        "mcar:0.5": ("robustness.csv", "1", "2", "15"),
+        "mcar:0.3": ("points.csv", "99", "1", "7"),
+    }
+
+
+# Commands -------------------------------------------------------------------------------------
+
+
+def commands(page: Path, program: str) -> list[str]:
+    return [line for line in page.read_text().splitlines() if f"recipes/{program}" in line]
+
+
+def test_the_evaluation_of_a_mixed_study_asks_no_agent_for_a_model_that_it_lacks(
+    tmp_path: Path,
+) -> None:
+    """Points of the grid are asked for as the grid, which knows; others run by run."""
+    grid = {"none:0": [1.0] * 30, "mcar:0.5": [1.0] * 30}
+    for method in ("drbpn", "gru"):
+        name = tmp_path / "runs" / method
+        folder = make_run(name, f"belief={method}", method=method, points=False)
+        model = {"reduction:0.5:model": [1.0] * 30} if method == "drbpn" else {}
+        episodes(folder, "robustness.csv", 10_000, grid | model)
+    report(str(tmp_path / "runs" / "*"), tmp_path / "out")
+    page = tmp_path / "out" / "README.md"
+    every = "for run in $(dirname runs/grid/*/config.yaml)"
+    assert commands(page, "evaluate.py")[0] == (
+        f"{every}; do python recipes/evaluate.py run=$run 'modes=[sampled]'; done"
+    )
+    for method in ("drbpn", "gru"):
+        folder = tmp_path / "runs" / method
+        (folder / "robustness.csv").rename(folder / "points.csv")
+    report(str(tmp_path / "runs" / "*"), tmp_path / "out")
+    first, second = commands(page, "evaluate.py")
+    assert first.startswith("for run in runs/grid/drbpn; do")
+    assert "reduction:0.5:model" in first
+    assert second.startswith("for run in runs/grid/gru; do")
+    assert "points=[none:0,mcar:0.5]" in second
+
+
+def test_the_command_of_an_evaluation_names_what_is_not_the_default(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", points=False)
+    episodes(folder, "robustness.csv", 7, {"nmar:0.5": [1.0] * 5, "spikes:0.05:5": [1.0] * 5})
+    report([folder], tmp_path / "out")
+    (line,) = commands(tmp_path / "out" / "README.md", "evaluate.py")
+    words = "full=true episodes=5 'modes=[sampled]' seed=7"
+    assert line == f"python recipes/evaluate.py run=runs/run {words}"
+    episodes(folder, "robustness.csv", 7, {"nmar:0.55": [1.0] * 5})  # on no grid
+    report([folder], tmp_path / "out")
+    (line,) = commands(tmp_path / "out" / "README.md", "evaluate.py")
+    assert "'points=[nmar:0.55]' episodes=5" in line
+
+
 # Rebuilding -----------------------------------------------------------------------------------
 
 
@@ -483,6 +591,33 @@ def test_a_report_is_made_again_from_a_copy_of_what_is_committed(
     run(ASKED | {"index": str(tmp_path / "results")})
     assert (tmp_path / "results" / "README.md").read_text() == index
     assert "# Three" in (study / "README.md").read_text()
+
+
+def test_the_committed_index_is_what_the_committed_tables_give() -> None:
+    """And those are what the committed runs give, as the next test says."""
+    results = ROOT / "results"
+    assert index_page(results, studies_of(results)) == (results / "README.md").read_text()
+
+
+def test_the_index_holds_the_tables_of_every_study_beside_the_papers_figures(
+    tmp_path: Path,
+) -> None:
+    results = tmp_path / "results"
+    for method, final in (("drbpn", 50.0), ("dvrl", 40.0)):
+        make_run(results / "gaps" / "runs" / method, method=method, final=final)
+    make_run(results / "clean" / "runs" / "a", "experiment=clean", "env.version=v4", points=False)
+    noisy = ("experiment=clean", "noise=gaussian", "noise.sigma=0.5", "env.version=v4")
+    make_run(results / "clean" / "runs" / "b", *noisy, final=7.0, points=False)
+    run(ASKED | {"index": str(results)})
+    clean, gaps = (results / "README.md").read_text().split("\n## ")[1:]
+    assert "| Hopper-v4 | `drbpn` | none:0, sigma 0 | 1 | **50.00** | **50.00** | 2000 |" in clean
+    assert "| Hopper-v4 | `drbpn` | none:0, sigma 0.5 | 1 | **7.00** | **7.00** |  |" in clean
+    assert "| task | method | trained on | seeds | training | none:0 | mcar:0.5 | mar:0.5 |" in gaps
+    line = "| Hopper-v4 | `dvrl` | mar:0.5, sigma 1 | 1 | **40.00** | **100** | **85.00** |"
+    assert line in gaps
+    line = "| Hopper-v4 | mar:0.5, sigma 1 | mar:0.5 | `dvrl` | 400 | +25 % | +20 % |"
+    assert line in gaps
+    assert "paper |" not in gaps.split("margin")[0]  # no threshold beside runs with gaps
 
 
 @pytest.mark.parametrize("study", COMMITTED, ids=lambda path: path.name)
@@ -531,6 +666,30 @@ def test_a_run_that_is_not_finished_is_refused_unless_asked_for(tmp_path: Path) 
     page = (tmp_path / "out" / "README.md").read_text()
     assert "`half` is not finished: 200 of 400 steps" in page
     assert "unfinished=true" in page
+
+
+def test_a_run_before_its_first_rollout_is_listed_and_does_not_stop_the_report(
+    seeds: list[Path], tmp_path: Path
+) -> None:
+    begun = make_run(tmp_path / "runs" / "begun", seed=3)
+    header = (begun / "metrics.csv").read_text().splitlines()[0]
+    # A row that is being written while the report reads has no end.
+    with (seeds[2] / "metrics.csv").open("a") as file:
+        file.write("500,1.0")
+    for content in (f"{header}\n", None):
+        if content is None:
+            (begun / "metrics.csv").unlink()
+        else:
+            (begun / "metrics.csv").write_text(content)
+        with pytest.raises(UserError, match=r"metrics\.csv"):
+            report([*seeds, begun], tmp_path / "out")
+        report([*seeds, begun], tmp_path / "out", unfinished=True)
+        page = (tmp_path / "out" / "README.md").read_text()
+        assert "- `begun` has finished no rollout yet\n" in page
+        assert quantity(tmp_path / "out", "training return")["seeds"] == "3"
+        shutil.rmtree(tmp_path / "out")
+    with pytest.raises(UserError, match="`run` must name runs with a finished rollout, 1 have no"):
+        report([begun], tmp_path / "out", unfinished=True)
 
 
 def test_runs_that_make_no_mean_together_are_refused(tmp_path: Path) -> None:

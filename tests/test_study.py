@@ -10,21 +10,25 @@ study; a run that a killed call has left behind is neither lost nor started twic
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 pytest.importorskip("hydra")
 from recipe_tools import ROOT, make_config, read_table  # isort: skip
 
 from assembly.checkpoint import checkpoint_frames
 from assembly.errors import UserError
+from assembly.run_folder import write_config
 from assembly.study_cells import StudyFolder
 from assembly.study_grid import Cell, read_grid
 from assembly.study_job import StudyJob
@@ -192,6 +196,25 @@ def test_the_time_left_is_that_of_runs_started_in_order() -> None:
     ]
 
 
+def test_the_overrides_that_a_study_suggests_leave_seeds_of_one_mean_alike() -> None:
+    """The comment beside ``cells`` is what a reader copies; report.py has to take what it gives."""
+    suggested = 0
+    for path in STUDIES:
+        config: Any = OmegaConf.to_container(OmegaConf.load(path))
+        comment = re.search(r"^cells:.*?#.*?(\{'.*?\})", path.read_text(), re.MULTILINE)
+        if comment is None:
+            continue
+        suggested += 1
+        config["cells"] = yaml.safe_load(comment[1])
+        by_mean: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+        for cell in read_grid(config).cells:
+            mean = tuple(choice for axis, choice in cell.choices.items() if axis != "seed")
+            words = tuple(sorted(w for w in cell.overrides if not w.startswith("seed=")))
+            by_mean.setdefault(mean, set()).add(words)
+        assert {len(words) for words in by_mean.values()} == {1}
+    assert suggested
+
+
 def test_a_slow_method_is_expected_to_be_slow_on_every_task() -> None:
     study = read_grid(grid_config()).cells
     known = {"hopper-gru-s0": 100.0, "hopper-ours-s0": 1000.0, "walker2d-gru-s0": 50.0}
@@ -209,9 +232,22 @@ def test_a_slow_method_is_expected_to_be_slow_on_every_task() -> None:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study of two cells, one of which can't be trained."""
     folder = tmp_path_factory.mktemp("runs") / "study"
-    good, bad = cells(*BRIEF, names=("good", "bad"))
-    bad = Cell("bad", bad.choices, (*bad.overrides, "env.id=NoSuchRobot"))
-    assert run(folder, [bad, good]) == 1
+    study = study_of(folder)
+    # Seen from outside, by the locks that processes hold: never more than were asked for.
+    seen, over = [], threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.05):
+            seen.append(sum(map(StudyFolder(folder).running, study)))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        assert run(folder, study, at_once=1) == 1
+    finally:
+        over.set()
+        watcher.join()
+    (folder.parent / "at_once").write_text(str(max(seen)))
     return folder
 
 
@@ -230,6 +266,10 @@ def test_a_cell_that_fails_is_recorded_with_its_last_line_and_does_not_stop_othe
     assert list(study.failures()) == ["bad"]
     assert study.failures()["bad"].startswith("error: `env_id` must be a registered")
     assert not list(finished.glob("**/.*.tmp"))
+
+
+def test_no_more_cells_run_at_once_than_were_asked_for(finished: Path) -> None:
+    assert (finished.parent / "at_once").read_text() == "1"
 
 
 def test_what_is_done_is_skipped_and_what_failed_waits_until_it_is_asked_for(
@@ -288,9 +328,17 @@ def test_two_calls_never_work_on_one_study(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "left",
-    ["nothing", "an empty folder", "a folder without checkpoint", "a checkpoint cut off"],
+    [
+        "nothing",
+        "an empty folder",
+        "a folder without checkpoint",
+        "a checkpoint cut off",
+        "a folder half removed",
+    ],
 )
-def test_what_a_killed_start_has_left_is_started_anew(tmp_path: Path, left: str) -> None:
+def test_what_a_killed_start_has_left_is_started_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str
+) -> None:
     study, (cell,) = StudyFolder(tmp_path), cells(*BRIEF)
     folder = study.run_folder(cell)
     if left == "an empty folder":
@@ -302,12 +350,61 @@ def test_what_a_killed_start_has_left_is_started_anew(tmp_path: Path, left: str)
         if left == "a checkpoint cut off":  # a temporary file, never renamed
             (folder / "checkpoints").mkdir()
             (folder / "checkpoints" / ".frames_000000000128.pt.7.tmp").write_bytes(b"half")
+    if left == "a folder half removed":
+        with monkeypatch.context() as killed:
+            killed.setattr("shutil.rmtree", _killed_after_the_first_file)
+            with pytest.raises(KeyboardInterrupt):
+                study.prepare(cell)
     study.check(cell)
     assert not study.finished(cell)
     assert not study.resumable(cell)
     assert study.measured(cell) is None
     study.prepare(cell)
     assert [path.name for path in folder.iterdir()] == ["cell.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def _killed_after_the_first_file(folder: Path) -> None:
+    """Remove cell.json, which a real removal may well come to first, and end there."""
+    (folder / "cell.json").unlink()
+    raise KeyboardInterrupt
+
+
+def test_the_printed_lines_hold_the_state_of_every_cell_and_the_time_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One cell is done, one half done at work, one waits: 100 steps a second."""
+    names = ("done", "works", "waits")
+    study = cells(*(w.replace("=256", "=3000") for w in BRIEF), names=names)
+    done, works = study[:2]
+    made = StudyFolder(tmp_path / "study")
+    for cell, frames in ((done, 3000), (works, 1500)):
+        made.prepare(cell)
+        folder = made.run_folder(cell)
+        write_config(folder, make_config(*cell.overrides))
+        text = f"frames,return,wall_time\n{frames},7.5,{frames / 100}\n"
+        (folder / "metrics.csv").write_text(text)
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / f"frames_{frames:012d}.pt").touch()
+    rows = [f"3000,final,{mode}" for mode in ("sampled", "mean")]
+    text = "\n".join(["frames,kind,mode", *rows]) + "\n"
+    (made.run_folder(done) / "evaluation.csv").write_text(text)
+    held = made.lock_cell(works)
+    try:
+        shown = job(made.path, study, at_once=1)
+        shown.look()
+        shown.show()
+    finally:
+        os.close(held)
+    lines = capsys.readouterr().out.splitlines()
+    # 15 s of the one at work, then 30 s of the one that waits.
+    head = "study: 1 done, 1 running, 1 queued, 0 failed; about 1 min of training left"
+    assert lines[0] == head
+    at_work = "1,500 of 3,000 steps, 100 steps/s, return 7.5, about 15 s left"
+    assert lines[1] == f"  running  works: {at_work}"
+    assert lines[2] == "  done     done: 3,000 steps, return 7.5"
+    assert lines[3].startswith("  queued   waits: python ")
+    assert len(lines) == 4
 
 
 def command(folder: Path, overrides: list[str], *more: str) -> list[str]:

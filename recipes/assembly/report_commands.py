@@ -5,14 +5,18 @@ from __future__ import annotations
 import functools
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from assembly.composition import composed_config
 from assembly.errors import UserError
-from assembly.report_runs import StudyRun, flat, point_order
+from assembly.evaluation_grid import Grid, grid_points, parse_points
+from assembly.report_evaluations import GRID_TABLE, Row, point_order
+from assembly.report_runs import StudyRun, flat
 
 # Always written out: a reader looks for them.
 _SHOWN = ("env.version", "seed", "total_frames")
@@ -68,32 +72,77 @@ def training_command(run: StudyRun) -> str:
     return " ".join(["python recipes/ppo_drbpn.py", *(shlex.quote(word) for word in words)])
 
 
-def evaluation_command(run: StudyRun) -> str | None:
-    """Return the command that evaluated a run's last checkpoint at several points.
+def evaluation_commands(runs: Sequence[StudyRun]) -> list[str]:
+    """Return the commands that evaluated the last checkpoints at several points.
 
     Args:
-        run: the run.
+        runs: of a report.
 
     Returns:
-        ``python recipes/evaluate.py`` with points, modes and episodes, of all cells where the run
-        is a cell of a study; None where it was not run.
+        Calls of ``recipes/evaluate.py``: of the grid where the points are its own, else with the
+        points of each run. Cells of a study that were evaluated alike are one loop, as each has its
+        table in its own run folder; of several runs at once evaluate.py makes one beside them.
     """
-    rows = [row for row in run.evaluations if row["source"] == "points"]
-    if not rows:
-        return None
+    commands: list[str] = []
+    loops: dict[tuple[str, str], list[StudyRun]] = {}
+    for run in runs:
+        for table in dict.fromkeys(row["table"] for row in run.evaluations):
+            rows = [r for r in run.evaluations if (r["source"], r["table"]) == ("points", table)]
+            if not rows:
+                continue
+            options = _evaluation_options(run, table, rows)
+            if run.study is None:
+                words = ["python recipes/evaluate.py", shlex.quote(f"run=runs/{run.name}"), options]
+                commands.append(" ".join(words).strip())
+            else:
+                loops.setdefault((run.study, options), []).append(run)
+    for (study, options), evaluated in loops.items():
+        cells = [run for run in runs if run.study == study]
+        if len(evaluated) == len(cells):
+            folders = f"$(dirname runs/{study}/*/config.yaml)"
+        else:
+            folders = " ".join(f"runs/{study}/{Path(run.name).name}" for run in evaluated)
+        call = f"python recipes/evaluate.py run=$run {options}".strip()
+        commands.append(f"for run in {folders}; do {call}; done")
+    return commands
+
+
+def _evaluation_options(run: StudyRun, table: str, rows: Sequence[Row]) -> str:
+    """Return the arguments that give the rows of one table of a run."""
+    defaults = _evaluation_defaults()
     points = sorted({row["point"] for row in rows}, key=point_order)
     present = {row["mode"] for row in rows}
     modes = [mode for mode in ("sampled", "mean") if mode in present]
     episodes = max(int(row["episodes"]) for row in rows)
-    words = [f"points=[{','.join(points)}]", f"episodes={episodes}"]
+    words = []
+    # evaluate.py leaves out by itself what an agent without a model can't be asked.
+    on_grid = table == GRID_TABLE
+    default = on_grid and set(points) <= _grid_names(run, full=False)
+    full = on_grid and set(points) <= _grid_names(run, full=True)
+    if not default:
+        words.append("full=true" if full else f"points=[{','.join(points)}]")
+    if episodes != defaults["episodes"] or not (default or full):
+        words.append(f"episodes={episodes}")
     if len(modes) < 2:
         words.append(f"modes=[{','.join(modes)}]")
-    options = " ".join(shlex.quote(word) for word in words)
-    if run.study is None:
-        return f"python recipes/evaluate.py {shlex.quote(f'run=runs/{run.name}')} {options}"
-    # One table in each run folder; of several runs at once evaluate.py makes one beside them.
-    folders = f"$(dirname runs/{run.study}/*/config.yaml)"
-    return f"for run in {folders}; do python recipes/evaluate.py run=$run {options}; done"
+    seeds = {row["episode_seed"] for row in rows} - {None, defaults["seed"]}
+    words += [f"seed={seed}" for seed in sorted(seeds)]
+    return " ".join(shlex.quote(word) for word in words)
+
+
+def _grid_names(run: StudyRun, *, full: bool) -> set[str]:
+    defaults = _evaluation_defaults()
+    texts = grid_points(Grid(**defaults["grid"]), full=full, model=True)
+    points = parse_points(texts, run.settings, float(defaults["spike_std"]))
+    return {point.name for point in points}
+
+
+@functools.cache
+def _evaluation_defaults() -> dict[str, Any]:
+    """Return conf/evaluate.yaml; to be read only."""
+    path = Path(__file__).parents[2] / "conf" / "evaluate.yaml"
+    config = OmegaConf.to_container(OmegaConf.load(path))
+    return {str(key): value for key, value in config.items()} if isinstance(config, dict) else {}
 
 
 def commands_from_nothing(
@@ -113,8 +162,7 @@ def commands_from_nothing(
     studies = list(dict.fromkeys(run.study for run in runs if run.study is not None))
     commands = [f"python recipes/study.py study={study}" for study in studies]
     commands += [training_command(run) for run in alone]
-    evaluations = [evaluation_command(run) for run in runs]
-    commands += list(dict.fromkeys(command for command in evaluations if command is not None))
+    commands += evaluation_commands(runs)
     folders = [f"runs/{study}/*" for study in studies]
     folders += sorted(f"runs/{run.name}" for run in alone)
     listed = folders[0] if len(folders) == 1 else f"[{','.join(folders)}]"

@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from assembly.belief_figure import STYLE
-from assembly.report_runs import StudyRun, grouped, point_kind, point_order
+from assembly.report_evaluations import point_kind, point_order
+from assembly.report_runs import StudyRun, grouped
 from assembly.report_statistics import Array, interquartile_mean, interval
 from assembly.report_tables import final_evaluation, training_rows
 

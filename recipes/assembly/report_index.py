@@ -1,11 +1,16 @@
-"""results/README.md: every study in a few lines."""
+"""results/README.md: every study in a few lines and its tables, from the CSV files of each."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from assembly.errors import UserError
+from assembly.report_cells import margin, markdown_table, percent, two_steps, with_interval
+from assembly.report_evaluations import Row, read_csv
+from assembly.report_paper import THRESHOLDS, task_family
+from assembly.report_runs import trained_on
 
 _HEAD = """# Results
 
@@ -18,6 +23,11 @@ This page, and every table below it, byte for byte from the run folders in `<stu
 ```bash
 python recipes/report.py index=results
 ```
+
+Returns are raw, of sampled actions: **interquartile mean** over seeds [95 % bootstrap interval].
+Training: the last 100 episodes; the other columns: the last checkpoint, evaluated with nothing
+missing (none:0) and with half of all entries missing or open to be (.5). The paper: its threshold
+of the return on complete, exact observations, and its margin over DVRL at ratio .5.
 
 The run folders hold their last checkpoints, so that an agent can be looked at without training it:
 
@@ -58,7 +68,8 @@ def index_page(folder: Path, studies: Sequence[Path]) -> str:
         studies: folders of it with a report.
 
     Returns:
-        Markdown: for each study its heading, and the first paragraph of its notes.md.
+        Markdown: for each study its heading, the first paragraph of its notes.md, and its tables:
+        returns by task and method, and the margins that the paper gives one of too.
     """
     parts = [_HEAD.strip()]
     for study in studies:
@@ -67,4 +78,59 @@ def index_page(folder: Path, studies: Sequence[Path]) -> str:
         notes = study / "notes.md"
         if notes.is_file():
             parts.append(notes.read_text(encoding="utf-8").strip().split("\n\n")[0])
-    return "\n\n".join(parts) + "\n"
+        parts += [_returns(study), _margins(study)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+_SHOWN = ("none:0", "mcar:0.5", "mar:0.5")  # points
+_TRAINING = "training return"
+
+
+def _returns(study: Path) -> str:
+    """Return the table of the returns of a study."""
+    groups: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in read_csv(study / "summary.csv", {"task", "method", "quantity", "point", "iqm"}):
+        evaluated = row["quantity"] == "evaluation return" and row["mode"] == "sampled"
+        if row["quantity"] == _TRAINING or (evaluated and row["point"] in _SHOWN):
+            row["variant"] = row.get("variant") or ""
+            group = (row["task"], row["method"], trained_on(row))
+            point = _TRAINING if row["quantity"] == _TRAINING else row["point"]
+            groups.setdefault(group, {})[point] = row
+    points = [p for p in _SHOWN if any(p in found for found in groups.values())]
+    complete = {
+        group
+        for group, found in groups.items()
+        if found[_TRAINING]["trained_on"] == "none:0" and found[_TRAINING]["noise_sigma"] == 0
+    }
+    rows = []
+    for group, found in groups.items():
+        task, method, corruption = group
+        cells = [with_interval(found[p]) if p in found else "" for p in (_TRAINING, *points)]
+        line = [task, f"`{method}`", corruption, f"{found[_TRAINING]['seeds']:g}", *cells]
+        if complete:
+            threshold = THRESHOLDS.get(task_family(task)) if group in complete else None
+            line.append("" if threshold is None else f"{threshold:g}")
+        rows.append(line)
+    head = ["task", "method", "trained on", "seeds", "training", *points]
+    return markdown_table([*head, "paper"] if complete else head, rows)
+
+
+def _margins(study: Path) -> str:
+    """Return the table of the margins that the paper gives one of too; nothing without any."""
+    path = study / "margins.csv"
+    needed = {"task", "over", "margin", "paper", "steps", "steps_over"}
+    rows = [
+        [
+            row["task"],
+            row["trained_on"],
+            row["point"],
+            f"`{row['over']}`",
+            two_steps(row),
+            margin(row),
+            percent(row["paper"]),
+        ]
+        for row in (read_csv(path, needed) if path.is_file() else [])
+        if row["paper"] is not None and row["mode"] == "sampled"
+    ]
+    head = ["task", "trained on", "evaluated on", "over", "steps", "margin of `drbpn`", "paper"]
+    return markdown_table(head, rows) if rows else ""

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from assembly.report_cells import margin, markdown_table, number, percent, two_steps, with_interval
 from assembly.report_commands import commands_from_nothing, rebuild_command
+from assembly.report_evaluations import Row
 from assembly.report_paper import THRESHOLDS, task_family
-from assembly.report_runs import Row, StudyRun, grouped, trained_on
+from assembly.report_runs import StudyRun, grouped, trained_on
 from assembly.report_statistics import interquartile_mean
 from assembly.report_tables import KEPT, format_number
 from assembly.report_variants import mark_best, variant_lines, variant_order
@@ -43,7 +45,7 @@ class Tables:
 
 def study_page(
     runs: Sequence[StudyRun], tables: Tables, figures: Sequence[str], *, title: str, notes: str,
-    name: str, options: Sequence[str] = (),
+    name: str, options: Sequence[str] = (), waiting: Sequence[str] = (),
 ) -> str:  # fmt: skip
     """Write the page.
 
@@ -55,11 +57,12 @@ def study_page(
         notes: what a person says about it, Markdown; put below the heading as it is.
         name: of the folder of the study.
         options: further arguments of the command that made the page.
+        waiting: names of runs that have finished no rollout yet.
 
     Returns:
         Markdown.
     """
-    parts = [f"# {title}", notes.strip(), _unfinished(runs)]
+    parts = [f"# {title}", notes.strip(), _unfinished(runs, waiting)]
     parts += [f"![{FIGURE_TEXTS[figure]}]({figure})" for figure in figures]
     parts += ["## Training", _TRAINING_TEXT, _training_table(runs, tables.summary)]
     parts += _variant_table(runs, tables.summary)
@@ -109,7 +112,9 @@ _EVALUATION_TEXT = (
     "Mean raw return of the episodes of a seed; **interquartile mean** over seeds [95 % bootstrap "
     "interval], then what that is of the same agents' return with nothing missing, where that was "
     "evaluated and is positive. Normalisation frozen, noise as in training. Missing ratio: "
-    "realised share over all components, mean over the methods of the row."
+    "realised share over all components, mean over the methods of the row. A point that was "
+    "evaluated both by itself (points.csv) and on the grid (robustness.csv) counts as on the grid; "
+    "evaluation.csv names the table and the seed of the episodes."
 )
 _AGGREGATE_TEXT = (
     "Returns as shares of the paper's thresholds (below 1: under the threshold), **interquartile "
@@ -118,8 +123,9 @@ _AGGREGATE_TEXT = (
 _MARGIN_TEXT = (
     "Where half of all entries may be missing: interquartile mean of drbpn's return over that of "
     "the other method, less one [95 % bootstrap interval, both resampled]. Beside it what the "
-    "paper gives: its margins over DVRL at ratio .5. Runs of unequal length are compared as they "
-    "are; their steps stand in the table of training."
+    "paper gives: its margins over DVRL at ratio .5. Steps: of drbpn, and of the other method. "
+    "Where they differ, the last checkpoints are compared as they are, which says nothing about "
+    "the methods alone; the row `training` compares training returns at the same number of steps."
 )
 _EFFICIENCY_TEXT = (
     "Complete, exact observations, within 2M environment steps. Top-10: the mean of the ten best "
@@ -129,13 +135,15 @@ _EFFICIENCY_TEXT = (
 )
 
 
-def _unfinished(runs: Sequence[StudyRun]) -> str:
+def _unfinished(runs: Sequence[StudyRun], waiting: Sequence[str]) -> str:
     """Say in a list which runs have not come to their end."""
-    return "\n".join(
+    lines = [
         f"- `{run.name}` is not finished: {run.frames:,} of {run.settings.total_frames:,} steps"
         for run in runs
         if not run.finished
-    )
+    ]
+    lines += [f"- `{name}` has finished no rollout yet" for name in waiting]
+    return "\n".join(lines)
 
 
 # Tables ---------------------------------------------------------------------------------------
@@ -149,13 +157,13 @@ def _training_table(runs: Sequence[StudyRun], summary: Sequence[Row]) -> str:
         first, *others = (found[quantity] for _, quantity in _TRAINING_COLUMNS)
         frames = sorted({run.frames for run in members})
         steps = " to ".join(f"{n:,}" for n in dict.fromkeys((frames[0], frames[-1])))
-        cells = [_with_seeds(first), *(_number(row["mean"]) for row in others)]
+        cells = [_with_seeds(first), *(number(row["mean"]) for row in others)]
         seeds = ", ".join(str(run.settings.seed) for run in members)
         rows.append(
             [group["task"], f"`{group['method']}`", trained_on(group), seeds, steps, *cells]
         )
     head = ["task", "method", "trained on", "seeds", "steps", *(n for n, _ in _TRAINING_COLUMNS)]
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _variant_table(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[str]:
@@ -184,13 +192,13 @@ def _variant_table(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[str
     corrupted = ["trained on"] * (max(map(len, lines)) - 2)
     names = [f"`{variant}`" if variant else "none" for variant in variants]
     head = ["task", "method", *corrupted, "seeds", "steps", *names]
-    return [f"## By {axes}", _VARIANT_TEXT, _table(head, rows)]
+    return [f"## By {axes}", _VARIANT_TEXT, markdown_table(head, rows)]
 
 
 def _variant_cell(row: Row, best: bool) -> str:
-    text = _number(row["iqm"]) or "none"
+    text = number(row["iqm"]) or "none"
     if row["low"] is not None:
-        text = f"{text} [{_number(row['low'])}, {_number(row['high'])}]"
+        text = f"{text} [{number(row['low'])}, {number(row['high'])}]"
     if not row["finished"]:
         return f"{text} at {min(run.frames for run in row['members']):,} steps"
     return f"**{text}**" if best else text
@@ -211,18 +219,18 @@ def _evaluation_tables(summary: Sequence[Row]) -> list[str]:
         for point, line in table.items():
             ratios = [line[m]["evaluation missing ratio"]["mean"] for m in methods if m in line]
             known = [ratio for ratio in ratios if ratio is not None]
-            ratio = _number(sum(known) / len(known)) if known else ""
+            ratio = number(sum(known) / len(known)) if known else ""
             rows.append([point, ratio, *(_evaluated(line.get(method, {})) for method in methods)])
         parts.append(f"### {task}, trained on {trained}, {_MODES[mode]}")
         head = ["evaluated on", "missing ratio", *(f"`{method}`" for method in methods)]
-        parts.append(_table(head, rows))
+        parts.append(markdown_table(head, rows))
     return parts
 
 
 def _evaluated(quantities: Mapping[str, Row]) -> str:
     if "evaluation return" not in quantities:
         return ""
-    text = _with_interval(quantities["evaluation return"])
+    text = with_interval(quantities["evaluation return"])
     kept = quantities.get(KEPT)
     return text if kept is None else f"{text} {100 * kept['iqm']:.0f} %"
 
@@ -232,13 +240,15 @@ def _aggregate_table(aggregate: Sequence[Row]) -> str:
     lines: dict[tuple[str, str, str], dict[str, str]] = {}
     for row in aggregate:
         key = (row["trained_on"], row["point"], _MODES[row["mode"]])
-        lines.setdefault(key, {})[row["method"]] = _with_interval(row)
+        lines.setdefault(key, {})[row["method"]] = with_interval(row)
     head = ["trained on", "evaluated on", "actions", *(f"`{method}`" for method in methods)]
-    return _table(head, [[*key, *(c.get(m, "") for m in methods)] for key, c in lines.items()])
+    return markdown_table(
+        head, [[*key, *(c.get(m, "") for m in methods)] for key, c in lines.items()]
+    )
 
 
 def _margin_table(margins: Sequence[Row]) -> str:
-    head = ["task", "trained on", "evaluated on", "actions", "over", "margin", "paper"]
+    head = ["task", "trained on", "evaluated on", "actions", "over", "steps", "margin", "paper"]
     rows = [
         [
             row["task"],
@@ -246,12 +256,13 @@ def _margin_table(margins: Sequence[Row]) -> str:
             row["point"],
             _MODES[row["mode"]],
             f"`{row['over']}`",
-            _margin(row),
-            "" if row["paper"] is None else _percent(row["paper"]),
+            two_steps(row),
+            margin(row),
+            "" if row["paper"] is None else percent(row["paper"]),
         ]
         for row in margins
     ]
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _efficiency_table(efficiency: Sequence[Row]) -> str:
@@ -279,7 +290,7 @@ def _efficiency_table(efficiency: Sequence[Row]) -> str:
             ]
         )
     head = ["task", "method", "seeds", "top-10 return", "threshold", "steps to the threshold"]
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 # Cells ----------------------------------------------------------------------------------------
@@ -287,10 +298,10 @@ def _efficiency_table(efficiency: Sequence[Row]) -> str:
 
 def _top(members: Sequence[Row]) -> str:
     values = [row["top_10_return"] for row in members]
-    own = ", ".join(_number(value) or "no episodes.csv" for value in values)
+    own = ", ".join(number(value) or "no episodes.csv" for value in values)
     if None in values:
         return own
-    return f"**{_number(float(interquartile_mean(np.array(values))))}** ({own})"
+    return f"**{number(float(interquartile_mean(np.array(values))))}** ({own})"
 
 
 def _with_seeds(row: Row) -> str:
@@ -298,42 +309,12 @@ def _with_seeds(row: Row) -> str:
     own = [part.split("=", 1)[1] for part in row["per_seed"].split()]
     if all(value == "" for value in own):
         return ""
-    shown = ", ".join(_number(float(value)) if value else "none" for value in own)
-    return f"{_with_interval(row)} ({shown})" if len(own) > 1 else _with_interval(row)
-
-
-def _with_interval(row: Row) -> str:
-    mean = "none" if row["iqm"] is None else _number(row["iqm"])
-    if row["low"] is None:
-        return f"**{mean}**"
-    return f"**{mean}** [{_number(row['low'])}, {_number(row['high'])}]"
-
-
-def _number(value: float | None) -> str:
-    if value is None:
-        return ""
-    if abs(value) >= 100:
-        return f"{value:.0f}"
-    return f"{value:.3f}" if abs(value) < 1 else f"{value:.2f}"
-
-
-def _margin(row: Row) -> str:
-    if row["low"] is None:
-        return _percent(row["margin"])
-    return f"{_percent(row['margin'])} [{_percent(row['low'])}, {_percent(row['high'])}]"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:+.0f} %"
+    shown = ", ".join(number(float(value)) if value else "none" for value in own)
+    return f"{with_interval(row)} ({shown})" if len(own) > 1 else with_interval(row)
 
 
 def _belongs(row: Row, group: Row) -> bool:
     return all(row[key] == value for key, value in group.items())
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _versions(runs: Sequence[StudyRun]) -> str:

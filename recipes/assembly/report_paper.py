@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from assembly.report_runs import Row, StudyRun, grouped, trained_on
+from assembly.report_evaluations import Row
+from assembly.report_runs import StudyRun, grouped, trained_on
 from assembly.report_statistics import interquartile_mean, interval, ratio_of_means
 
 # Returns that an agent shall reach on complete, exact observations, v4, within 2M steps.
@@ -24,6 +25,7 @@ WITHIN = 2_000_000  # environment steps
 # By how much the paper's DRBPN is ahead of its DVRL at missing ratio .5.
 MARGINS_OVER_DVRL = {"Hopper": 0.20, "Walker2d": 0.75, "HalfCheetah": 1.00}
 
+_TRAINING = "training"  # in place of a point
 _TOP = 10  # episodes
 _WINDOW = 100  # episodes of the mean that has to reach the threshold
 
@@ -110,14 +112,24 @@ def efficiency_rows(runs: Sequence[StudyRun]) -> list[Row]:
 def margin_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row]:
     """Return by how much drbpn is ahead of every other method where half of all may be missing.
 
+    Where the two were trained for unequal numbers of steps, a further row compares their training
+    returns at as many steps as the shorter has.
+
     Args:
         runs: of a study.
         summary: rows of :func:`assembly.report_tables.summary_rows`.
 
     Returns:
-        Rows ``task, trained_on, point, mode, over, margin, low, high, paper``: a ratio of
-        interquartile means minus one with its 95 % interval, both methods resampled.
+        Rows ``task, trained_on, point, mode, over, steps, steps_over, margin, low, high, paper``:
+        a ratio of interquartile means minus one with its 95 % interval, both methods resampled;
+        environment steps of drbpn and of the other, of its shortest run. ``point`` is ``training``
+        where they are compared at equal steps.
     """
+    members = {
+        (run.group["task"], trained_on(run.group), run.group["method"]): group
+        for group in grouped(runs)
+        for run in group[:1]
+    }
     returns = {
         (*_place(row), row["method"]): row["values"]
         for row in summary
@@ -125,16 +137,46 @@ def margin_rows(runs: Sequence[StudyRun], summary: Sequence[Row]) -> list[Row]:
     }
     order = list(dict.fromkeys(members[0].group["method"] for members in grouped(runs)))
     rows = []
+    unequal: dict[tuple[str, str, str], list[Row]] = {}
     for (*place, method), values in returns.items():
         if method != "drbpn":
             continue
+        task, trained = place[:2]
+        own = members[task, trained, method]
         for other in order:
             against = returns.get((*place, other))
             # Of a return that is not positive no share can be told.
             if other == method or not values or not against or min(against) <= 0:
                 continue
-            rows.append(_margin(place, other, values, against))
-    return rows
+            others = members[task, trained, other]
+            rows.append(_margin(place, other, (_steps(own), _steps(others)), values, against))
+            if _steps(own) != _steps(others):
+                unequal.setdefault((task, trained, other), _at_equal_steps(own, others))
+    return rows + [row for found in unequal.values() for row in found]
+
+
+def _steps(members: Sequence[StudyRun]) -> int:
+    return min(run.frames for run in members)
+
+
+def _at_equal_steps(own: Sequence[StudyRun], others: Sequence[StudyRun]) -> list[Row]:
+    """Compare training returns at as many steps as the shorter has; no row where there are none."""
+    frames = min(_steps(own), _steps(others))
+    values, against = ([_training_return(run, frames) for run in side] for side in (own, others))
+    known = [value for value in values if value is not None]
+    known_other = [value for value in against if value is not None]
+    if len(known) < len(values) or len(known_other) < len(against) or min(known_other) <= 0:
+        return []
+    group = own[0].group
+    place = (group["task"], trained_on(group), _TRAINING, "sampled")
+    row = _margin(place, others[0].method, (frames, frames), known, known_other)
+    return [row if _half_missing(group["trained_on"]) else row | {"paper": None}]
+
+
+def _training_return(run: StudyRun, frames: int) -> float | None:
+    """Return the training return as it stood last within so many steps."""
+    reached = [row["return"] for row in run.training if row["frames"] <= frames]
+    return reached[-1] if reached else None
 
 
 def aggregate_rows(summary: Sequence[Row]) -> list[Row]:
@@ -182,7 +224,7 @@ def aggregate_rows(summary: Sequence[Row]) -> list[Row]:
 
 
 def _half_missing(point: str) -> bool:
-    family, ratio, *_ = point.split(":")
+    family, ratio, *_ = point.split(" ")[0].split(":")
     return family in ("mcar", "mar", "nmar", "reduction") and float(ratio) == 0.5
 
 
@@ -195,7 +237,13 @@ def _place(row: Row) -> tuple[str, str, str, str]:
     )
 
 
-def _margin(place: Sequence[str], other: str, values: list[float], against: list[float]) -> Row:
+def _margin(
+    place: Sequence[str],
+    other: str,
+    steps: tuple[int, int],
+    values: list[float],
+    against: list[float],
+) -> Row:
     ends = interval([values, against], ratio_of_means)
     task, trained, point, mode = place
     paper = MARGINS_OVER_DVRL.get(task_family(task)) if other == "dvrl" else None
@@ -206,6 +254,8 @@ def _margin(place: Sequence[str], other: str, values: list[float], against: list
         "point": point,
         "mode": mode,
         "over": other,
+        "steps": steps[0],
+        "steps_over": steps[1],
         "margin": float(ratio) - 1,
         "low": None if ends is None else float(ends[0]) - 1,
         "high": None if ends is None else float(ends[1]) - 1,

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import glob
 import json
-import math
 import os
-import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from assembly.errors import UserError
+from assembly.report_evaluations import Row, evaluations, mean_of_known, read_csv
 from assembly.report_variants import further_choices, variant_order
 from assembly.run_folder import CELL_FILE, read_config
 from assembly.settings import Settings, missingness_name, read_settings
 
-Row = dict[str, Any]
 # What may differ between the runs of one mean: it changes no number that is reported.
 _NOT_COMPARED = ("seed", "threads", "resume", "logger", "checkpoint", "evaluation")
 
@@ -34,7 +31,7 @@ class StudyRun:
         versions: what it was made with.
         training: rows of metrics.csv, numbers; None where a cell is empty.
         episodes: rows of episodes.csv; none where it is not there.
-        evaluations: rows of :func:`_evaluations`.
+        evaluations: rows of :func:`assembly.report_evaluations.evaluations`.
         study: the study of recipes/study.py that it is a cell of; None: it was run by itself.
         method: what the study calls it; the belief module's name where it was run by itself.
         axes: its choices on axes of the study beside task, method and seed.
@@ -70,7 +67,7 @@ class StudyRun:
         return {
             "task": s.env.env_id,
             "method": self.method,
-            "trained_on": missingness_name(s.missingness),
+            "trained_on": _corruption(s),
             "noise_sigma": s.noise.sigma,
             "variant": ", ".join(self.axes.values()),
         }
@@ -118,6 +115,29 @@ def find_folders(wanted: str | Sequence[str]) -> list[Path]:
     return sorted(unique.values())
 
 
+def without_rollout(folders: Sequence[Path]) -> list[Path]:
+    """Return the runs that have been started and have finished no rollout yet.
+
+    Args:
+        folders: run folders.
+
+    Returns:
+        Those without a row in metrics.csv; a folder that holds checkpoints, or can't be read, is
+        not among them: :func:`read_study` says what it lacks.
+    """
+    return [
+        folder
+        for folder in folders
+        if (folder / "config.yaml").is_file()
+        and not any(folder.glob("checkpoints/*.pt"))
+        and not _has_row(folder / "metrics.csv")
+    ]
+
+
+def _has_row(path: Path) -> bool:
+    return path.is_file() and len(path.read_bytes().splitlines()) > 1
+
+
 def read_study(folders: Sequence[Path], *, unfinished: bool = False) -> list[StudyRun]:
     """Read runs, and check that they make a study.
 
@@ -144,6 +164,14 @@ def read_study(folders: Sequence[Path], *, unfinished: bool = False) -> list[Stu
     for members in grouped(runs):
         _check_group(members)
     return runs
+
+
+def _corruption(settings: Settings) -> str:
+    """Name what did not arrive in training and what was wrong, Gaussian noise left out."""
+    missing, noise = missingness_name(settings.missingness), settings.noise
+    if not noise.spike_probability:
+        return missing
+    return f"{missing} spikes:{noise.spike_probability:g}:{noise.spike_std:g}"
 
 
 def _order(run: StudyRun) -> tuple[Any, ...]:
@@ -229,7 +257,7 @@ def _read_run(folder: Path, name: str) -> StudyRun:
         settings = read_settings(config)
     except UserError as error:
         raise UserError(f"`{folder / 'config.yaml'}`: {error}") from error
-    training = _read_csv(folder / "metrics.csv", {"frames", "return", "missing_ratio"})
+    training = read_csv(folder / "metrics.csv", {"frames", "return", "missing_ratio"})
     if not training:
         raise UserError(f"`{folder}` holds no finished rollout: metrics.csv is empty.")
     path = folder / "episodes.csv"
@@ -240,8 +268,8 @@ def _read_run(folder: Path, name: str) -> StudyRun:
         settings,
         _read_versions(folder),
         training,
-        _read_csv(path, {"frames", "return"}) if path.is_file() else [],
-        _evaluations(folder, settings),
+        read_csv(path, {"frames", "return"}) if path.is_file() else [],
+        evaluations(folder, settings),
         study,
         method or _method(settings),
         further_choices(folder),
@@ -275,138 +303,3 @@ def _read_versions(folder: Path) -> dict[str, str]:
     if not isinstance(versions, dict):
         raise UserError(f"`{path}` must hold versions by name, got {type(versions).__name__}.")
     return {str(key): str(value) for key, value in versions.items()}
-
-
-def _read_csv(path: Path, needed: set[str]) -> list[Row]:
-    """Return the rows of a table: numbers where they are some, None for an empty cell."""
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            absent = needed - set(reader.fieldnames or ())
-            rows = [{key: _number(cell) for key, cell in row.items()} for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"`{path}` can't be read: is it in a run folder?") from error
-    if absent:
-        raise UserError(f"`{path}` lacks the columns {', '.join(sorted(absent))}: another table?")
-    return rows
-
-
-def _number(cell: Any) -> Any:
-    if not cell:
-        return None
-    try:
-        return float(cell)
-    except (TypeError, ValueError):
-        return cell
-
-
-def _evaluations(folder: Path, settings: Settings) -> list[Row]:
-    """Return one row an evaluation: those of the run, then those of recipes/evaluate.py."""
-    rows = []
-    path = folder / "evaluation.csv"
-    for row in _read_csv(path, {"frames", "kind", "mode", "return_mean"}) if path.is_file() else []:
-        rows.append(
-            {"source": row["kind"], "point": missingness_name(settings.missingness)}
-            | {key: row.get(key) for key in _EVALUATED}
-        )
-    # Of points that were asked for, and of the grid; a point of both has the same episodes twice.
-    episodes: list[Row] = []
-    for path in (folder / "points.csv", folder / "robustness.csv"):
-        if path.is_file():
-            needed = {"frames", "mechanism", "eta", "mode", "return", "length"}
-            episodes += _read_csv(path, needed)
-    return rows + _points(episodes)
-
-
-_EVALUATED = (
-    "frames",
-    "mode",
-    "episodes",
-    "return_mean",
-    "return_std",
-    "length_mean",
-    "missing_ratio",
-    "log_likelihood",
-)
-
-
-def _points(episodes: Sequence[Row]) -> list[Row]:
-    """Sum up the episodes of recipes/evaluate.py, one row a point and kind of action."""
-    together: dict[tuple[Any, ...], dict[Any, Row]] = {}
-    for index, row in enumerate(episodes):
-        # Older tables have no name of the point.
-        eta = 0.0 if row["mechanism"] == "none" else row["eta"]
-        point = row.get("point") or f"{row['mechanism']}:{eta:g}"
-        key = (row["frames"], point, row["mode"])
-        # A point that was asked for under two names has the same episodes twice.
-        together.setdefault(key, {})[row.get("episode", index)] = row
-    rows = []
-    for (frames, point, mode), by_episode in together.items():
-        found = list(by_episode.values())
-        returns = [row["return"] for row in found]
-        steps = [row["length"] for row in found]
-        arrived = [n * (1 - row["missing_ratio"]) for n, row in zip(steps, found, strict=True)]
-        likelihoods = [row.get("log_likelihood") for row in found]
-        rows.append(
-            {
-                "source": "points",
-                "point": point,
-                "frames": frames,
-                "mode": mode,
-                "episodes": len(found),
-                "return_mean": mean_of_known(returns),
-                "return_std": statistics.stdev(returns) if len(returns) > 1 else 0.0,
-                "length_mean": mean_of_known(steps),
-                # Over all steps and entries, as in evaluation.csv.
-                "missing_ratio": 1 - sum(arrived) / sum(steps),
-                "log_likelihood": (
-                    None
-                    if None in likelihoods
-                    else sum(v * w for v, w in zip(likelihoods, arrived, strict=True))
-                    / max(sum(arrived), 1e-12)
-                ),
-            }
-        )
-    return rows
-
-
-def mean_of_known(values: Iterable[Any]) -> Any:
-    """Return the mean of the values that are not None; None where there is none.
-
-    Args:
-        values: numbers or None.
-
-    Returns:
-        The mean.
-    """
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None
-
-
-def point_order(point: str) -> tuple[str, float]:
-    """Return what points are sorted by: nothing missing first, then by kind and number.
-
-    Args:
-        point: as ``recipes/evaluate.py`` names it.
-
-    Returns:
-        A key for ``sorted``: the kind, and the number in which points of it differ: the nominal
-        ratio, the mean length of outages, the size of noise, the probability of spikes.
-    """
-    kind, parts = point_kind(point), point.split(":")
-    number = parts[2] if parts[0] == "outages" and len(parts) > 2 else parts[1]
-    return "" if kind == "none" else kind, float(number)
-
-
-def point_kind(point: str) -> str:
-    """Return what points have in common that differ in one number.
-
-    Args:
-        point: such as ``mcar:0.5``, ``reduction:0.5:random`` or ``outages:0.5:20:sensor``.
-
-    Returns:
-        Such as ``mcar``, ``reduction random`` or ``outages 0.5 sensor``.
-    """
-    family, *rest = point.split(":")
-    varied = 1 if family == "outages" and len(rest) > 1 else 0
-    return " ".join([family, *(part for i, part in enumerate(rest) if i != varied)])

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from assembly.report_runs import Row, StudyRun, grouped, mean_of_known, point_order
+from assembly.report_evaluations import Row, mean_of_known, point_order
+from assembly.report_runs import StudyRun, grouped
 from assembly.report_statistics import interquartile_mean, interval
 
 

@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from assembly.report_evaluations import Row
 from assembly.run_folder import CELL_FILE
 
 # Axes that a report knows by themselves: a mean is taken over seeds, within a task and a method.
 _USUAL = ("task", "method", "seed")
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-
-Row = dict[str, Any]
 
 
 def further_choices(folder: Path) -> dict[str, str]:

@@ -114,8 +114,14 @@ class StudyFolder:
             cell: to be started.
         """
         folder = self.run_folder(cell)
+        # Hidden at once, removed at leisure: half a folder without cell.json would look like
+        # somebody else's to the call that goes on.
+        hidden = self.path / f".{cell.name}.removed"
+        if hidden.exists():
+            shutil.rmtree(hidden)  # an earlier call was killed at this point
         if folder.exists() and not self.resumable(cell):
-            shutil.rmtree(folder)
+            folder.rename(hidden)
+            shutil.rmtree(hidden)
         folder.mkdir(parents=True, exist_ok=True)
         about = {
             "study": self.path.name,

@@ -77,14 +77,24 @@ class StudyJob:
                 self._queue.append(cell)
 
     def show(self) -> None:
-        """Print how far every cell is, and the command of each that is not done."""
+        """Print how far every cell is, and the command of each that is to be started."""
         self._report()
         failures = self.folder.failures()
         for cell in self.cells:
-            if cell.name in self._done or cell.name in self._found:
+            if cell.name in self._found:
+                continue  # has its line already
+            if cell.name in self._done:
+                say(f"  done     {cell.name}: {self._reached(cell)}")
                 continue
             state = "failed" if cell.name in failures and cell not in self._queue else "queued"
             say(f"  {state:8s} {cell.name}: {shlex.join(['python', *self._command(cell)[1:]])}")
+
+    def _reached(self, cell: Cell) -> str:
+        measured = self.folder.measured(cell)
+        frames = measured.frames if measured else self.folder.total_frames(cell)
+        text = f"{frames:,} steps"
+        known = measured is not None and measured.mean_return is not None
+        return f"{text}, return {measured.mean_return:.1f}" if measured and known else text
 
     # Running --------------------------------------------------------------------------------------
 
