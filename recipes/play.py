@@ -48,7 +48,9 @@ def run(config: dict[str, Any]) -> int:
         trained,
         point.missingness,
         noise=point.noise,
-        removed=removed_sensors(point, trained, config["reduction_seed"]),
+        removed=removed_sensors(
+            point, trained, episodes=1, reduction_seed=config["reduction_seed"]
+        ),
         mode=config["mode"],
         seed=config["seed"],
         start=begin,
@@ -87,7 +89,13 @@ def _check(config: dict[str, Any]) -> Path:
     """Refuse what can't be filmed, before an agent is loaded; return where the film goes."""
     if config["run"] is None:
         raise UserError("`run` must name a run folder: run=runs/<folder>.")
-    for name, least in (("steps", 1), ("every", 1), ("window", 2), ("start", 0)):
+    for name, least in (
+        ("steps", 1),
+        ("every", 1),
+        ("window", 2),
+        ("start", 0),
+        ("reduction_seed", 0),
+    ):
         if config[name] < least:
             raise UserError(f"`{name}` must be {least} or more, got {config[name]}.")
     for name, (least, most) in (("size", _WIDTHS), ("colours", _COLOURS)):

@@ -26,16 +26,20 @@ sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 from assembly import evaluation_grid
 from assembly.errors import UserError
+from assembly.evaluation import Episodes
 from assembly.evaluation_grid import Grid, evaluate_tasks, grid_points
 from assembly.points import Point, evaluate_points, parse_point, removed_sensors
 from assembly.robustness_figure import draw_robustness, mean_interval, read_rows
 from assembly.run import run as train
+from assembly.sensor_choice import kept_sensors
 from assembly.sensor_groups import sensor_groups
 from assembly.sensors import named_tasks, sensor_names
 from assembly.settings import Settings, read_settings
 from assembly.trained import TrainedAgent, load_trained_agent
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+
+from torchrl_drbpn.functional import draw_mechanism
 
 SMOKE = (
     "experiment=smoke",
@@ -167,21 +171,62 @@ def test_each_family_changes_what_the_agent_gets(agent: TrainedAgent) -> None:
     assert spiked < clean  # a reading that is 5 off is not what the model expects
 
 
+def removed_at_random(ratio: float, trained: TrainedAgent, episodes: int, seed: int = 0) -> Any:
+    point = parse(f"reduction:{ratio}:random", trained.settings)
+    return removed_sensors(point, trained, episodes=episodes, reduction_seed=seed)
+
+
 def test_random_reduction_is_the_same_for_every_agent_and_nested(
     agent: TrainedAgent, feedforward: Path
 ) -> None:
     other = load_trained_agent(feedforward)
-
-    def chosen_for(ratio: float) -> list[list[int]]:
-        point = parse(f"reduction:{ratio}:random", agent.settings)
-        return [removed_sensors(point, any_agent, 0) for any_agent in (agent, other)]
-
-    chosen = [chosen_for(ratio) for ratio in (0.25, 0.5, 1.0)]
-    assert all(first == second for first, second in chosen)
-    assert [len(first) for first, _ in chosen] == [1, 2, 4]
-    assert set(chosen[0][0]) < set(chosen[1][0]) < set(chosen[2][0])
+    smaller = torch.zeros(30, 4, dtype=torch.bool)
+    for ratio, count in ((0.25, 1), (0.5, 2), (1.0, 4)):
+        removed = removed_at_random(ratio, agent, 30)
+        assert torch.equal(removed, removed_at_random(ratio, other, 30))
+        assert removed.sum(-1).tolist() == [count] * 30
+        assert (removed | ~smaller).all()
+        smaller = removed
     with pytest.raises(UserError, match="has learned no H, P and R"):
-        removed_sensors(parse("reduction:0.5:model", other.settings), other, 0)
+        removed_sensors(
+            parse("reduction:0.5:model", other.settings), other, episodes=1, reduction_seed=0
+        )
+
+
+def test_each_episode_lacks_sensors_of_its_own_by_its_number_alone(agent: TrainedAgent) -> None:
+    many = removed_at_random(0.5, agent, 400)
+    assert torch.equal(removed_at_random(0.5, agent, 3), many[:3])
+    assert not torch.equal(removed_at_random(0.5, agent, 400, seed=1), many)
+    assert len({tuple(row) for row in many.tolist()}) == 6  # all pairs of four
+    # Every sensor is removed in half of the episodes; five standard deviations of 400 draws.
+    assert (many.double().mean(0) - 0.5).abs().max() < 5 * 0.5 / 400**0.5
+    chosen = removed_sensors(
+        parse("reduction:0.5:model", agent.settings), agent, episodes=3, reduction_seed=0
+    )
+    assert chosen is not None
+    assert (chosen == chosen[0]).all()
+    kept = (~chosen[0]).nonzero().squeeze(-1).tolist()
+    assert sorted(kept_sensors(agent, 2)) == kept
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_random_reduction_does_not_draw_what_training_never_lost(
+    agent: TrainedAgent, seed: int
+) -> None:
+    """Both seeds are 0 by default: the always observed sensors must not be those removed."""
+    both, episodes = 0.0, 400
+    for row in removed_at_random(0.25, agent, episodes, seed):
+        drawn = draw_mechanism("mar", 4, 1, generator=torch.Generator().manual_seed(seed))
+        both += int((row & drawn.always_observed).any())
+    # One of four is always observed, one of four is removed: they meet in a quarter.
+    assert abs(both / episodes - 0.25) < 5 * (0.25 * 0.75 / episodes) ** 0.5
+
+
+def test_a_small_share_of_one_entry_weighs_as_what_it_is() -> None:
+    """In two episodes one entry of 100 arrived in all: its likelihood is that of the evaluation."""
+    few = Episodes([0.0, 0.0], [10, 10], [0.99, 1.0], [-2.5, 0.0])
+    assert few.log_likelihood == pytest.approx(-2.5)
+    assert Episodes([0.0], [10], [1.0], [0.0]).log_likelihood == 0.0
 
 
 # The grid -------------------------------------------------------------------------------------

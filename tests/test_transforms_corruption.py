@@ -331,6 +331,27 @@ def test_indices_and_bools_name_the_same_sensors():
     assert SensorReduction([])(data())["observed"].all()
 
 
+def test_each_row_may_lack_sensors_of_its_own():
+    rows = torch.rand(4, OBS, generator=torch.Generator().manual_seed(0)) < 0.5
+    reduction = SensorReduction(rows)
+    assert torch.equal(reduction(data())["observed"], ~rows)
+    after = reduction(data(observed=existing_mask()))
+    assert torch.equal(after["observed"], ~rows & existing_mask())
+    after["observed"].fill_(True)
+    assert torch.equal(reduction(data())["observed"], ~rows)  # the data does not hold the choice
+    env = staircase(SensorReduction(rows), batch=4)
+    assert torch.equal(env.rollout(3)["next", "observed"], (~rows).unsqueeze(1).expand(4, 3, OBS))
+
+
+@pytest.mark.parametrize("shape", [(3, OBS), (1, OBS), (2, 4, OBS)])
+def test_rows_for_another_batch_are_refused(shape):
+    rows = torch.zeros(shape, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"`missing` with a row .* = \(4, 5\), got"):
+        SensorReduction(rows)(data())
+    with pytest.raises(ValueError, match="`missing` must be a list of indices, or bool"):
+        SensorReduction(torch.zeros(shape, dtype=torch.int64))
+
+
 def test_rows_of_a_mask_do_not_share_memory():
     after = SensorReduction([1])(data())
     after["observed"][0, 0] = False

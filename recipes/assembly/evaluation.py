@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -55,13 +56,17 @@ class Episodes:
 
     @property
     def log_likelihood(self) -> float | None:
-        """Return the nats per observed entry over all steps; None without a model."""
+        """Return the nats per observed entry over all steps; None without a model.
+
+        0 where nothing arrived.
+        """
         if self.log_likelihoods is None:
             return None
         ratios = zip(self.missing_ratios, self.lengths, strict=True)
         weights = [(1 - ratio) * length for ratio, length in ratios]
         total = sum(v * w for v, w in zip(self.log_likelihoods, weights, strict=True))
-        return total / max(sum(weights), 1.0)
+        # The weights are counts over the number of components: one entry of many is below 1.
+        return total / max(sum(weights), 1e-12)
 
 
 def make_evaluation_environment(
@@ -73,7 +78,7 @@ def make_evaluation_environment(
     missingness: MissingnessSettings | None = None,
     noise: NoiseSettings | None = None,
     complete: bool = False,
-    removed: Sequence[int] = (),
+    removed: Tensor | None = None,
 ) -> TransformedEnv:
     """Build an environment like the training one, one simulator an episode.
 
@@ -85,13 +90,14 @@ def make_evaluation_environment(
         missingness: what does not arrive; None: as in training.
         noise: what is added; None: as in training.
         complete: whether to write ``complete_observation`` too, for measurements alone.
-        removed: components that never arrive, on top of ``missingness``.
+        removed: components that never arrive, on top of ``missingness``: bool of shape
+            ``(episodes, obs)``; None: there are none.
 
     Returns:
         The environment. Its statistics are empty: see
         :func:`assembly.environment.copy_statistics`.
     """
-    reduction = [SensorReduction(list(removed))] if removed else []
+    reduction = [] if removed is None else [SensorReduction(removed)]
     env = make_environment(
         settings.env,
         missingness or settings.missingness,

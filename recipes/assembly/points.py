@@ -8,7 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from assembly.errors import UserError
 from assembly.evaluation import Episodes, evaluate, make_evaluation_environment
@@ -143,30 +145,43 @@ def _number(text: str, most: float = math.inf) -> float | None:
 # Evaluating -----------------------------------------------------------------------------------
 
 
-def removed_sensors(point: Point, trained: TrainedAgent, reduction_seed: int) -> list[int]:
+def removed_sensors(
+    point: Point, trained: TrainedAgent, *, episodes: int, reduction_seed: int
+) -> Tensor | None:
     """Return the sensors that a point takes away for good.
+
+    At random, every episode lacks sensors of its own: a mean over episodes is one over choices too,
+    and its interval holds their spread. The order in which an episode loses sensors is drawn from
+    ``reduction_seed`` and its number alone, so that every agent of a task meets the same choices,
+    and those of a smaller ratio are among those of a larger one. The stream is not that of the
+    missingness mechanisms, whose always observed components come from seeds of the same size.
 
     Args:
         point: the point.
-        trained: the agent, whose model may choose.
-        reduction_seed: of the random choice: the same sensors for every agent of a task, those of a
-            smaller ratio among those of a larger one.
+        trained: the agent, whose model may choose; its one choice holds for every episode.
+        episodes: how many.
+        reduction_seed: of the random choices, not negative.
 
     Returns:
-        Indices of components, in order.
+        Bool of shape ``(episodes, obs)``, True where there is no sensor; None: all are there.
 
     Raises:
         UserError: if the model is to choose and there is none.
     """
     if not point.selection:
-        return []
+        return None
     obs_dim = trained.statistics.observation_spec["observation"].shape[-1]
     count = round(point.ratio * obs_dim)
+    removed = torch.zeros(episodes, obs_dim, dtype=torch.bool)
     if point.selection == "model":
-        kept = set(kept_sensors(trained, obs_dim - count))
-        return [index for index in range(obs_dim) if index not in kept]
-    generator = torch.Generator().manual_seed(reduction_seed)
-    return sorted(torch.randperm(obs_dim, generator=generator)[:count].tolist())
+        removed[:] = True
+        removed[:, kept_sensors(trained, obs_dim - count)] = False
+        return removed
+    for episode, row in enumerate(removed):
+        # NumPy's generator takes both numbers as its seed; torch's takes one.
+        order = np.random.default_rng((reduction_seed, episode)).permutation(obs_dim)
+        row[torch.from_numpy(order[:count])] = True
+    return removed
 
 
 def evaluate_points(
@@ -199,7 +214,10 @@ def evaluate_points(
         raise UserError(f"`episodes` must be positive, got {episodes}.")
     for mode in modes:
         check_mode(mode)
-    removed = [removed_sensors(point, trained, reduction_seed) for point in points]
+    removed = [
+        removed_sensors(point, trained, episodes=episodes, reduction_seed=reduction_seed)
+        for point in points
+    ]
     for point, sensors in zip(points, removed, strict=True):
         env = make_evaluation_environment(
             trained.settings,

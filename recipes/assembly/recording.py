@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -88,7 +87,7 @@ def record_episode(
     start: int,
     steps: int,
     noise: NoiseSettings | None = None,
-    removed: Sequence[int] = (),
+    removed: torch.Tensor | None = None,
 ) -> Recording:
     """Let a trained agent act and write down what it saw, missed and believed.
 
@@ -100,7 +99,8 @@ def record_episode(
         start: steps of the episode to leave out.
         steps: steps to keep; fewer where the episode ends before.
         noise: what is added to what arrives; None: as in training.
-        removed: components that never arrive, on top of ``missingness``.
+        removed: components that never arrive, on top of ``missingness``: bool of shape
+            ``(1, obs)``; None: there are none.
 
     Returns:
         The recording.

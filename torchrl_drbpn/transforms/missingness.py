@@ -272,8 +272,9 @@ class SensorReduction(CorruptingTransform):
 
     Args:
         missing: the components without a sensor; indices (negative ones count from the end), or
-            bool of shape `(obs,)`, True where there is none. Several observation keys count as one
-            vector.
+            bool of shape `(obs,)`, True where there is none, or of shape `(*batch, obs)`, with the
+            batch of the data: each row, such as each environment of a batch, lacks sensors of its
+            own. Several observation keys count as one vector.
 
     Keyword Args:
         in_keys: observation keys, each of shape `(*batch, obs)`.
@@ -282,14 +283,17 @@ class SensorReduction(CorruptingTransform):
             before this transform; None, the default, records nothing.
 
     Raises:
-        ValueError: if an index is out of range or the bool vector is of another length.
+        ValueError: if an index is out of range or the bool tensor is of another shape.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> data = TensorDict({"observation": torch.ones(2, 3)}, [2])
-        >>> SensorReduction([0, -1])(data)["observation"].tolist()
+        >>> SensorReduction([0, -1])(data.clone())["observation"].tolist()
         [[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
+        >>> rows = torch.tensor([[True, False, False], [False, True, False]])
+        >>> SensorReduction(rows)(data)["observation"].tolist()
+        [[0.0, 1.0, 1.0], [1.0, 0.0, 1.0]]
     """
 
     role: ClassVar[Role] = "missingness"
@@ -306,10 +310,16 @@ class SensorReduction(CorruptingTransform):
         tensor = torch.as_tensor(missing)
         if tensor.numel() == 0 and tensor.dtype != torch.bool:
             tensor = tensor.to(torch.int64).reshape(-1)
-        if tensor.ndim != 1 or tensor.is_floating_point() or tensor.is_complex():
+        is_bool = tensor.dtype == torch.bool
+        if (
+            tensor.ndim == 0
+            or (tensor.ndim > 1 and not is_bool)
+            or tensor.is_floating_point()
+            or tensor.is_complex()
+        ):
             raise ValueError(
-                "`missing` must be a list of indices or a bool vector, True where there is no "
-                f"sensor, got {missing!r}."
+                "`missing` must be a list of indices, or bool of shape (obs,) or (*batch, obs), "
+                f"True where there is no sensor, got {missing!r}."
             )
         self.missing = tensor.cpu()
         self._present: Tensor | None = None
@@ -317,10 +327,10 @@ class SensorReduction(CorruptingTransform):
     def _check_obs_dim(self, obs_dim: int) -> None:
         missing = self.missing
         if missing.dtype == torch.bool:
-            if missing.shape[0] != obs_dim:
+            if missing.shape[-1] != obs_dim:
                 raise ValueError(
                     f"`missing` as bool must have one entry per component, {obs_dim}, for in_keys "
-                    f"{self.in_keys}, got {missing.shape[0]}."
+                    f"{self.in_keys}, got {missing.shape[-1]}."
                 )
         elif bool(((missing < -obs_dim) | (missing >= obs_dim)).any()):
             raise ValueError(
@@ -339,13 +349,23 @@ class SensorReduction(CorruptingTransform):
         present = self._present
         if (
             present is None
-            or present.shape[0] != observation.shape[-1]
+            or present.shape[-1] != observation.shape[-1]
             or present.device != observation.device
         ):
             self._check_obs_dim(observation.shape[-1])
-            present = torch.ones(observation.shape[-1], dtype=torch.bool)
-            present[self.missing] = False
+            if self.missing.dtype == torch.bool:
+                present = ~self.missing
+            else:
+                present = torch.ones(observation.shape[-1], dtype=torch.bool)
+                present[self.missing] = False
             present = self._present = present.to(observation.device)
+        if present.ndim > 1 and present.shape != observation.shape:
+            # never broadcast: rows that were meant for other environments would go unnoticed
+            raise ValueError(
+                "`missing` with a row of its own for each row of the data must be bool of shape "
+                f"(*batch, obs) = {tuple(observation.shape)}, got {tuple(present.shape)}. One "
+                "choice for all rows has the shape (obs,)."
+            )
         arrived = present.expand(observation.shape)
         # a copy of its own in both cases: what is expanded shares memory between rows
         arrived = arrived.clone() if observed is None else arrived & observed
