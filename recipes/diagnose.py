@@ -8,7 +8,7 @@ steps since a sensor was last seen.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,14 @@ from assembly.diagnosis_figures import (
 )
 from assembly.diagnosis_tables import calibration_rows, precision_rows, reliability_rows
 from assembly.errors import UserError
-from assembly.points import read_point
+from assembly.evaluation_grid import parse_points
+from assembly.methods import training_labels
+from assembly.points import Point, check_reduction_seed, removed_sensors
 from assembly.report_page import csv_cells
 from assembly.report_runs import find_folders
 from assembly.run_folder import write_table
-from assembly.settings import MissingnessSettings, check_mode, missingness_name
-from assembly.trained import TrainedAgent, load_trained_agent
+from assembly.settings import check_mode, missingness_name
+from assembly.trained import TrainedAgent, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
 
 _FIGURES = ("precision.png", "outages.png", "reliability.png")
@@ -49,8 +51,11 @@ def run(config: dict[str, Any]) -> int:
         raise UserError("`run` must name run folders: run=<folder> or 'run=runs/*'.")
     check_mode(config["mode"])
     class_names(config["bins"])
+    if config["episodes"] < 1:
+        raise UserError(f"`episodes` must be positive, got {config['episodes']}.")
     if config["resamples"] < 2:
         raise UserError(f"`resamples` must be 2 or more, got {config['resamples']}.")
+    check_reduction_seed(config["reduction_seed"])
     if not config["points"]:
         raise UserError("`points` must hold at least one, such as trained or mcar:0.5.")
     folders = find_folders(config["run"])
@@ -59,18 +64,20 @@ def run(config: dict[str, Any]) -> int:
     out = Path(config["out"] or folders[0])
     if out.exists() and not out.is_dir():
         raise UserError(f"`out` must be a folder, {out} is a file.")
+    folders = with_checkpoint(folders)
     torch.set_num_threads(config["threads"])
     options = {"resamples": config["resamples"], "seed": config["seed"]}
     precision: list[dict[str, Any]] = []
     calibration: list[dict[str, Any]] = []
     reliability: list[dict[str, Any]] = []
-    series: dict[tuple[str, str, str, str], list[Tally]] = {}
+    series: dict[tuple[str, str, str, str, float], list[Tally]] = {}
     for folder, trained, point, tally in _diagnoses(folders, config):
         common = _common(folder, trained, point, config["mode"], tally)
         precision += [common | row for row in precision_rows(tally, **options)]
         calibration += [common | row for row in calibration_rows(tally, **options)]
         reliability += [common | row for row in reliability_rows(tally)]
-        kind = (common["task"], common["point"], common["belief"], common["trained_on"])
+        sigma = trained.settings.noise.sigma
+        kind = (common["task"], common["point"], common["method"], common["trained_on"], sigma)
         series.setdefault(kind, []).append(tally)
     out.mkdir(parents=True, exist_ok=True)
     write_table(out / "precision.csv", csv_cells(precision))
@@ -79,7 +86,7 @@ def run(config: dict[str, Any]) -> int:
             write_table(out / name, csv_cells(rows))
         else:
             (out / name).unlink(missing_ok=True)  # of an earlier diagnosis, no longer true
-    pooled = [Series(*kind, len(tallies), pool(tallies)) for kind, tallies in series.items()]
+    pooled = _pooled(series)
     figures = (
         precision_figure(pooled, **options),
         outage_figure(pooled, **options),
@@ -94,9 +101,19 @@ def run(config: dict[str, Any]) -> int:
     return 0
 
 
+def _pooled(series: Mapping[tuple[str, str, str, str, float], list[Tally]]) -> list[Series]:
+    """Put the runs of one task, point, method and kind of training together."""
+    # What it was trained on is told by the figures; sigma is told here where it differs.
+    labels = training_labels((method, "", sigma) for *_, method, _, sigma in series)
+    return [
+        Series(task, point, labels[method, "", sigma], trained_on, len(tallies), pool(tallies))
+        for (task, point, method, trained_on, sigma), tallies in series.items()
+    ]
+
+
 def _diagnoses(
     folders: list[Path], config: dict[str, Any]
-) -> Iterator[tuple[Path, TrainedAgent, MissingnessSettings, Tally]]:
+) -> Iterator[tuple[Path, TrainedAgent, Point, Tally]]:
     """Yield a tally for each run and point, and say in a line what it came to."""
     for folder in folders:
         trained = load_trained_agent(folder)
@@ -106,11 +123,18 @@ def _diagnoses(
                 f"{folder.name}: belief={name} keeps no estimate of its sensors; the rows are "
                 "those of the last value and the running mean"
             )
-        read = [read_point(str(p), trained.settings.missingness) for p in config["points"]]
-        for point in dict.fromkeys(read):
+        texts = [str(point) for point in config["points"]]
+        for point in parse_points(texts, trained.settings, float(config["spike_std"])):
             tally = diagnose(
                 trained,
-                point,
+                point.missingness,
+                noise=point.noise,
+                removed=removed_sensors(
+                    point,
+                    trained,
+                    episodes=config["episodes"],
+                    reduction_seed=config["reduction_seed"],
+                ),
                 episodes=config["episodes"],
                 mode=config["mode"],
                 seed=config["seed"],
@@ -120,9 +144,9 @@ def _diagnoses(
             yield folder, trained, point, tally
 
 
-def _summary(folder: Path, point: MissingnessSettings, tally: Tally) -> str:
+def _summary(folder: Path, point: Point, tally: Tally) -> str:
     """Return a line: the error of each estimate where sensors are missing, NIS over entries."""
-    parts = [f"{folder.name}, {missingness_name(point)}, missing {tally.missing_ratio:.3f}"]
+    parts = [f"{folder.name}, {point.name}, missing {tally.missing_ratio:.3f}"]
     for row in precision_rows(tally, resamples=2, seed=0):
         if row["entries"] == "missing" and row["steps_since_seen"] == "all":
             parts.append(f"{row['estimate']} {row['rmse']:.3f}")
@@ -133,7 +157,7 @@ def _summary(folder: Path, point: MissingnessSettings, tally: Tally) -> str:
 
 
 def _common(
-    folder: Path, trained: TrainedAgent, point: MissingnessSettings, mode: str, tally: Tally
+    folder: Path, trained: TrainedAgent, point: Point, mode: str, tally: Tally
 ) -> dict[str, Any]:
     """Return the columns that all rows of a run at a point have."""
     settings = trained.settings
@@ -141,9 +165,10 @@ def _common(
         "run": folder.name,
         "task": settings.env.env_id,
         "belief": str(settings.belief.get("name", "")),
+        "method": trained.method,
         "training_seed": settings.seed,
         "trained_on": missingness_name(settings.missingness),
-        "point": missingness_name(point),
+        "point": point.name,
         "missing_ratio": tally.missing_ratio,
         "mode": mode,
         "episodes": len(tally.lengths),

@@ -8,6 +8,7 @@ with its 95 % interval over the nominal and the realised missing ratio.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,12 +26,14 @@ from assembly.evaluation_grid import (
     grid_points,
     parse_points,
 )
-from assembly.points import Point
+from assembly.points import Point, check_reduction_seed, identity
 from assembly.report_runs import find_folders
 from assembly.robustness_figure import draw_robustness, read_rows
 from assembly.sensor_choice import kept_sensors
+from assembly.sensor_groups import have_names
+from assembly.sensors import sensor_names
 from assembly.settings import check_mode
-from assembly.trained import TrainedAgent, load_trained_agent
+from assembly.trained import TrainedAgent, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
 
 
@@ -45,22 +48,24 @@ def run(config: dict[str, Any]) -> int:
     """
     folders, protocol = _folders(config), _protocol(config)
     output = _output(config, folders)
+    folders = with_checkpoint(folders)
     agents = {folder: load_trained_agent(folder) for folder in folders}
     wanted = [(f, point) for f in folders for point in _points(config, f.name, agents[f])]
     results = Results(
         output,
         protocol,
-        {folder.name: agent.frames for folder, agent in agents.items()},
+        {folder.name: identity(agent) for folder, agent in agents.items()},
         overwrite=config["overwrite"],
     )
-    tasks = [task for task in wanted if results.lacks(task[0].name, task[1])]
+    lacking = [(folder, point, results.lacks(folder.name, point)) for folder, point in wanted]
+    tasks = [task for task in lacking if task[2]]
     if len(tasks) < len(wanted):
         say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
     order = [(folder.name, point.name) for folder, point in wanted]
     processes = config["processes"] or len(os.sched_getaffinity(0))
     for done, (folder, point, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
         results.add(folder.name, point.name, rows)
-        say(f"{done}/{len(tasks)} {folder.name} {point.name}: {_summary(rows, protocol.modes)}")
+        say(f"{done}/{len(tasks)} {folder.name} {point.name}: {_summary(rows)}")
     results.arrange(order)
     results.write()
     say(f"written: {output}")
@@ -92,6 +97,7 @@ def _protocol(config: dict[str, Any]) -> Protocol:
             not isinstance(value, int) or isinstance(value, bool) or value < 1
         ):
             raise UserError(f"`{name}` must be a whole number of at least 1, got {value!r}.")
+    check_reduction_seed(config["reduction_seed"])
     if not config["modes"]:
         raise UserError("`modes` must hold sampled, mean or both, got none.")
     for mode in config["modes"]:
@@ -125,16 +131,29 @@ def _points(config: dict[str, Any], name: str, trained: TrainedAgent) -> list[Po
         except UserError as error:
             model = False
             say(f"{name}: sensors are removed at random only; {error}")
-        texts = grid_points(Grid(**config["grid"]), full=config["full"], model=model)
+        grid = Grid(**config["grid"])
+        if config["full"] and not have_names(_sensor_names(trained)):
+            grid = dataclasses.replace(grid, outage_groups=["sensor"])
+            say(
+                f"{name}: outages of single sensors only; those of {trained.settings.env.env_id} "
+                "have no names to group them by"
+            )
+        texts = grid_points(grid, full=config["full"], model=model)
     texts = [str(text) for text in ([texts] if isinstance(texts, str) else texts)]
     return parse_points(texts, trained.settings, float(config["spike_std"]))
 
 
-def _summary(rows: Sequence[dict[str, Any]], modes: Sequence[str]) -> str:
+def _sensor_names(trained: TrainedAgent) -> list[str]:
+    env = trained.settings.env
+    shape = trained.statistics.observation_spec["observation"].shape
+    return sensor_names(env.id, env.version, shape[-1])
+
+
+def _summary(rows: Sequence[dict[str, Any]]) -> str:
     steps = sum(row["length"] for row in rows)
     missing = sum(row["missing_ratio"] * row["length"] for row in rows) / steps
     parts = [f"missing {missing:.3f}"]
-    for mode in modes:
+    for mode in dict.fromkeys(row["mode"] for row in rows):
         returns = [row["return"] for row in rows if row["mode"] == mode]
         parts.append(f"{mode} {sum(returns) / len(returns):.1f}")
     return ", ".join(parts)

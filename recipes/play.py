@@ -18,7 +18,7 @@ from assembly.console import say, start
 from assembly.errors import UserError
 from assembly.film import Film, Frame, robot_size
 from assembly.frames import render_or_say
-from assembly.points import parse_point, removed_sensors
+from assembly.points import check_reduction_seed, parse_point, removed_sensors
 from assembly.recording import Recording, record_episode
 from assembly.settings import check_mode, missingness_name
 from assembly.trained import load_trained_agent
@@ -89,19 +89,14 @@ def _check(config: dict[str, Any]) -> Path:
     """Refuse what can't be filmed, before an agent is loaded; return where the film goes."""
     if config["run"] is None:
         raise UserError("`run` must name a run folder: run=runs/<folder>.")
-    for name, least in (
-        ("steps", 1),
-        ("every", 1),
-        ("window", 2),
-        ("start", 0),
-        ("reduction_seed", 0),
-    ):
+    for name, least in (("steps", 1), ("every", 1), ("window", 2), ("start", 0)):
         if config[name] < least:
             raise UserError(f"`{name}` must be {least} or more, got {config[name]}.")
     for name, (least, most) in (("size", _WIDTHS), ("colours", _COLOURS)):
         if not least <= config[name] <= most:
             raise UserError(f"`{name}` must be in [{least}, {most}], got {config[name]}.")
     check_mode(config["mode"])
+    check_reduction_seed(config["reduction_seed"])
     out = Path(config["out"] or Path(config["run"]) / "play.gif")
     if not Path(config["run"]).is_dir():
         raise UserError(f"`run` must be a run folder, got {config['run']}.")

@@ -2,7 +2,8 @@
 
 From the last checkpoint of each run: which sensors tell most about the state by the learned H, P
 and R (sensor_ranking.png, sensor_ranking.csv), and the covariance H P H' + R of what they read in
-one step (observation_covariance.png). Runs of one task and one kind of training are drawn together.
+one step (observation_covariance.png). Runs of one task, method and training corruption are drawn
+together; runs that have not learned these are left out.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from assembly.run_folder import write_table
 from assembly.sensor_choice import SensorModel, learned_sensors
 from assembly.sensor_figures import covariance_figure, ranking_figure
 from assembly.settings import missingness_name
-from assembly.trained import TrainedAgent, load_trained_agent
+from assembly.trained import TrainedAgent, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
 
 _Run = tuple[TrainedAgent, SensorModel]
@@ -45,11 +46,21 @@ def run(config: dict[str, Any]) -> int:
     out = Path(config["out"] or folders[0])
     if out.exists() and not out.is_dir():
         raise UserError(f"`out` must be a folder, {out} is a file.")
+    folders = with_checkpoint(folders)
     torch.set_num_threads(1)  # many small matrices
+    agents = [(folder, load_trained_agent(folder)) for folder in folders]
     groups: dict[str, list[_Run]] = {}
-    for folder in folders:
-        trained = load_trained_agent(folder)
-        groups.setdefault(_title(trained), []).append((trained, learned_sensors(trained)))
+    for folder, trained in agents:
+        try:
+            model = learned_sensors(trained)
+        except UserError as error:
+            if len(folders) == 1:
+                raise
+            say(f"{folder.name}: left out; {error}")
+            continue
+        groups.setdefault(_title(trained), []).append((trained, model))
+    if not groups:
+        raise UserError("`run` must name runs that have learned H, P and R; none of these has.")
     for members in groups.values():
         members.sort(key=lambda member: member[1].seed)
     models = {title: [model for _, model in members] for title, members in groups.items()}
@@ -63,17 +74,16 @@ def run(config: dict[str, Any]) -> int:
     )
     save_figure(ranking, out / "sensor_ranking.png", dpi=config["dpi"], palette=True)
     save_figure(covariance, out / "observation_covariance.png", dpi=config["dpi"], palette=True)
-    say(f"{len(folders)} runs, written: {out}/sensor_ranking.png, .csv, observation_covariance.png")
+    runs = f"{len(members)} run{'s' if len(members) > 1 else ''}"
+    say(f"{runs}, written: {out}/sensor_ranking.png, .csv, observation_covariance.png")
     return 0
 
 
 def _title(trained: TrainedAgent) -> str:
     """Name what the runs of one column have in common."""
     settings = trained.settings
-    return (
-        f"{settings.env.env_id}\ntrained on {missingness_name(settings.missingness)}, "
-        f"sigma {settings.noise.sigma:g}"
-    )
+    what = f"trained on {missingness_name(settings.missingness)}, sigma {settings.noise.sigma:g}"
+    return f"{settings.env.env_id}, {trained.method}\n{what}"
 
 
 def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, Any]]:
@@ -92,6 +102,7 @@ def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, An
     settings = trained.settings
     common = {
         "env": settings.env.env_id,
+        "method": trained.method,
         "trained_on": missingness_name(settings.missingness),
         "noise_sigma": settings.noise.sigma,
         "training_seed": settings.seed,

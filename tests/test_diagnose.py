@@ -52,6 +52,8 @@ DEFAULTS: dict[str, Any] = {
     "mode": "sampled",
     "seed": 4,
     "bins": BINS,
+    "spike_std": 5.0,
+    "reduction_seed": 0,
     "resamples": 20,
     "threads": 1,
 }
@@ -393,6 +395,46 @@ def test_the_same_seed_gives_the_same_bytes_beside_the_run_where_no_folder_is_na
     assert run(str(folders["drbpn"]), tmp_path) == 0
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (folders["drbpn"] / path.name).read_bytes(), path.name
+
+
+def test_every_point_of_an_evaluation_can_be_diagnosed(
+    folders: dict[str, Path], tmp_path: Path
+) -> None:
+    points = ["reduction:0.5:random", "noise:30", "spikes:0.5"]
+    assert run(str(folders["drbpn"]), tmp_path, points=points) == 0
+    with (tmp_path / "precision.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["steps_since_seen"] in ("all", "never")]
+    found = {(row["point"], row["entries"], row["estimate"]): row for row in rows}
+    assert {row["point"] for row in rows} == {"reduction:0.5:random", "noise:30", "spikes:0.5:5"}
+    assert found["reduction:0.5:random", "missing", "filtered"]["missing_ratio"] == "0.5"
+    # Removed sensors are never seen: all that is missing is of that class.
+    lost = [r for r in rows if r["point"].startswith("reduction") and r["entries"] == "missing"]
+    assert {row["steps_since_seen"] for row in lost} == {"all", "never"}
+    with (tmp_path / "calibration.csv").open(newline="") as file:
+        surprise = {
+            row["point"]: float(row["nis_per_dof"])
+            for row in csv.DictReader(file)
+            if row["held_against"] == "reading" and row["steps_since_seen"] == "all"
+        }
+    assert surprise["spikes:0.5:5"] > 3 * surprise["reduction:0.5:random"]
+
+
+def test_runs_of_two_methods_are_two_curves(folders: dict[str, Path], tmp_path: Path) -> None:
+    """Both are belief=drbpn: what is pooled goes by the method."""
+    plain = make_folder(tmp_path / "plain", "loss.model_coeff=0")
+    methods = [load_trained_agent(folder).method for folder in (folders["drbpn"], plain)]
+    tally = tally_of(load_trained_agent(plain), episodes=1)
+    kinds = {("task", "none:0", method, "mcar:0.4", 1.0): [tally] for method in methods}
+    pooled = diagnose._pooled(kinds)
+    assert {one.belief: one.runs for one in pooled} == {"drbpn": 1, "drbpn (model_coeff 0)": 1}
+    louder = kinds | {("task", "none:0", "drbpn", "mcar:0.4", 3.0): [tally]}
+    assert "drbpn, sigma 3" in {one.belief for one in diagnose._pooled(louder)}
+    assert run([str(folders["drbpn"]), str(plain)], tmp_path / "out") == 0
+    with (tmp_path / "out" / "precision.csv").open(newline="") as file:
+        assert {(row["run"], row["method"]) for row in csv.DictReader(file)} == {
+            ("drbpn", "drbpn"),
+            ("plain", "drbpn (model_coeff 0)"),
+        }
 
 
 def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(

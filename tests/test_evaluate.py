@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -237,13 +239,21 @@ def test_the_default_grid_is_that_of_the_paper_and_the_full_one_goes_beyond(
 ) -> None:
     grid = Grid(**configured()["grid"])
     points = grid_points(grid, full=False, model=True)
-    assert points[0] == "none:0"
-    assert len(points) == 1 + 4 * 5
-    assert {p.split(":")[0] for p in points} == {"none", "mcar", "mar", "reduction"}
+    ratios = ("0.2", "0.4", "0.5", "0.6", "0.8")
+    families = ("mcar:{}", "mar:{}", "reduction:{}:model", "reduction:{}:random")
+    assert points == ["none:0", *(f.format(ratio) for f in families for ratio in ratios)]
     assert not any("model" in p for p in grid_points(grid, full=True, model=False))
     everything = grid_points(grid, full=True, model=True)
-    assert set(points) < set(everything)
-    assert {"nmar:0.5", "outages:0.5:50:joint", "noise:30", "spikes:0.2"} < set(everything)
+    beyond = [f"nmar:{ratio}" for ratio in ratios]
+    # A sensor that is off half of the time has outages of at least one step.
+    lengths, groups = (1, 2, 5, 10, 20, 50), ("sensor", "joint", "kind")
+    beyond += [f"outages:0.5:{length}:{by}" for by in groups for length in lengths]
+    beyond += [f"noise:{sigma}" for sigma in (0, 1, 3, 10, 30)]
+    beyond += [f"spikes:{probability}" for probability in (0.01, 0.05, 0.1, 0.2)]
+    assert sorted(everything) == sorted([*points, *beyond])
+    assert len(points) == 21
+    assert len(everything) == 53
+    assert configured()["modes"] == ["sampled", "mean"]
     for point in everything:
         parse(point, settings)
 
@@ -333,6 +343,80 @@ def test_a_table_of_other_settings_is_not_mixed_with(
         evaluate(out, drbpn, points="none:0", **change)
     rows = evaluate(out, drbpn, points="none:0", overwrite=True, **change)
     assert len(rows) == 2 * change.get("episodes", 2)
+
+
+def test_another_study_of_the_same_folder_names_is_not_taken_for_it(
+    drbpn: Path, feedforward: Path, tmp_path: Path
+) -> None:
+    """Cells are called alike in every study: the name of a folder says nothing of whose it is."""
+    out = tmp_path / "out.csv"
+    first, second = (tmp_path / study / "hopper-s0" for study in ("robust", "clean"))
+    shutil.copytree(drbpn, first)
+    evaluate(out, first, points="none:0")
+    before = out.read_bytes()
+    shutil.copytree(feedforward, second)
+    with pytest.raises(UserError, match="holds hopper-s0 at none:0 with belief drbpn, and none is"):
+        evaluate(out, second, points="none:0")
+    shutil.rmtree(second)
+    shutil.copytree(drbpn, second)
+    cell = {"study": "clean", "choices": {"method": "drbpn", "seed": "s0"}}
+    (second / "cell.json").write_text(json.dumps(cell))
+    with pytest.raises(UserError, match="with study none, and clean is asked for"):
+        evaluate(out, second, points="none:0")
+    assert out.read_bytes() == before
+
+
+def test_another_choice_of_random_sensors_is_not_mixed_with(drbpn: Path, tmp_path: Path) -> None:
+    out, points = tmp_path / "out.csv", "'reduction:0.5:random'"
+    rows = evaluate(out, drbpn, points=points + ",none:0")
+    assert {(row["point"], row["reduction_seed"]) for row in rows} == {
+        ("reduction:0.5:random", "0"),
+        ("none:0", ""),
+    }
+    with pytest.raises(UserError, match="with reduction_seed 0, and 3 is asked for"):
+        evaluate(out, drbpn, points=points, reduction_seed=3)
+    with pytest.raises(UserError, match="`reduction_seed` must be a whole number of at least 0"):
+        evaluate(out, drbpn, points=points, reduction_seed=-1)
+
+
+def test_one_kind_of_action_after_the_other_gives_the_table_of_both(
+    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both, apart = tmp_path / "both.csv", tmp_path / "apart.csv"
+    evaluate(both, drbpn, points="none:0,'mcar:0.5'")
+    evaluate(apart, drbpn, points="none:0,'mcar:0.5'", modes=["mean"])
+    evaluate(apart, drbpn, points="none:0,'mcar:0.5'", modes=["sampled"])
+    assert apart.read_bytes() == both.read_bytes()
+    capsys.readouterr()
+    evaluate(apart, drbpn, points="none:0,'mcar:0.5'", modes=["mean"])
+    assert "2 of 2 points are in" in capsys.readouterr().out
+    assert apart.read_bytes() == both.read_bytes()
+
+
+def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(
+    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    young = tmp_path / "young"
+    young.mkdir()
+    shutil.copy(drbpn / "config.yaml", young)
+    rows = evaluate(tmp_path / "out.csv", drbpn, young, points="none:0")
+    assert {row["run"] for row in rows} == {"drbpn"}
+    assert "young: left out, it has no checkpoint yet" in capsys.readouterr().out
+    with pytest.raises(UserError, match="young` holds no checkpoint"):
+        evaluate(tmp_path / "out.csv", young, points="none:0")
+
+
+def test_the_full_grid_of_a_task_without_sensor_names_has_no_groups(
+    agent: TrainedAgent, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env = dataclasses.replace(agent.settings.env, id="Homemade")
+    unnamed = dataclasses.replace(agent, settings=dataclasses.replace(agent.settings, env=env))
+    names = {point.name for point in recipe._points(configured("full=true"), "run", unnamed)}
+    assert "outages:0.5:20:sensor" in names
+    assert not any(name.endswith((":joint", ":kind")) for name in names)
+    assert "run: outages of single sensors only; those of Homemade-v5" in capsys.readouterr().out
+    with_names = {point.name for point in recipe._points(configured("full=true"), "run", agent)}
+    assert "outages:0.5:20:joint" in with_names
 
 
 def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path) -> None:

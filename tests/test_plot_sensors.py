@@ -9,6 +9,7 @@ The recipe writes two pictures and a table, whole, and answers bad input with on
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -241,6 +242,34 @@ def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(tmp_path:
         assert (np.diff([float(row["information"]) for row in part]) >= 0).all()
         assert (np.diff([float(row["variance_left"]) for row in part]) <= 0).all()
     assert rows[0]["sensor"] == "torso angular velocity"
+
+
+def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    young = tmp_path / "young"
+    young.mkdir()
+    shutil.copy(RUNS / "hopper-v4-s0" / "config.yaml", young)
+    runs = [str(NO_MODEL), str(RUNS / "hopper-v4-s0"), str(young)]
+    assert draw(runs, tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    assert "hopper-v4-none-s0: left out; `belief=none` has learned no H, P and R" in said
+    assert "young: left out, it has no checkpoint yet" in said
+    assert "1 run, written" in said
+    with (tmp_path / "out" / "sensor_ranking.csv").open(newline="") as file:
+        assert {row["method"] for row in csv.DictReader(file)} == {"drbpn"}
+    with pytest.raises(UserError, match="`run` must name runs that have learned H, P and R"):
+        draw([str(NO_MODEL), str(NO_MODEL.with_name("hopper-v4-gru-s0"))], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_methods_are_drawn_apart(copied: Path, agents: list[TrainedAgent]) -> None:
+    cell = {"study": "clean", "choices": {"method": "ppo_ours", "seed": "s0"}}
+    (copied / "cell.json").write_text(json.dumps(cell))
+    other = load_trained_agent(copied)
+    assert plot_sensors._title(other).startswith("Hopper-v4, ppo_ours\n")
+    assert plot_sensors._title(agents[0]).startswith("Hopper-v4, drbpn\n")
+    assert plot_sensors._title(agents[0]) == plot_sensors._title(agents[1])
 
 
 def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(copied: Path) -> None:

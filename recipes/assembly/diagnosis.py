@@ -30,7 +30,7 @@ from assembly.beliefs import (
 from assembly.environment import copy_statistics
 from assembly.errors import UserError
 from assembly.evaluation import make_evaluation_environment
-from assembly.settings import MissingnessSettings
+from assembly.settings import MissingnessSettings, NoiseSettings
 from assembly.trained import TrainedAgent
 from torchrl_drbpn import seed_env
 from torchrl_drbpn.functional import (
@@ -107,16 +107,21 @@ def diagnose(
     mode: str,
     seed: int,
     bins: Sequence[int],
+    noise: NoiseSettings | None = None,
+    removed: Tensor | None = None,
 ) -> Tally:
     """Let a trained agent act and hold its belief against what was the case.
 
     Args:
         trained: the agent.
-        missingness: what does not arrive; the noise is that of its training.
+        missingness: what does not arrive.
         episodes: how many; the first of each environment of a batch.
         mode: ``sampled`` actions or ``mean`` actions.
         seed: of episodes, corruption and sampled actions. The global generator is left alone.
         bins: where the classes of steps since last seen begin; the first is 1.
+        noise: what is added to what arrives; None: as in training.
+        removed: components that never arrive, bool of shape ``(episodes, obs)``; None: there are
+            none.
 
     Returns:
         The sums. An agent whose belief knows nothing of the sensors has those of the last value
@@ -138,7 +143,9 @@ def diagnose(
         trained.agent,
         episodes=episodes,
         missingness=missingness,
+        noise=noise,
         complete=True,
+        removed=removed,
     )
     copy_statistics(trained.statistics, env)
     components = env.observation_spec["observation"].shape[-1]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 
@@ -27,6 +27,13 @@ from assembly.settings import Settings
 from assembly.trained import TrainedAgent, load_trained_agent
 
 Row = Mapping[str, Any]
+
+# A table without one of these was written by an earlier version, or by another command.
+_COLUMNS = {
+    *("run", "study", "env", "belief", "method", "training_seed", "frames", "trained_on"),
+    *("trained_noise_sigma", "point", "removed_by", "mode", "episode", "seed", "reduction_seed"),
+}
+_AGAIN = "name another `output`, or overwrite=true begins anew."
 
 
 @dataclass(frozen=True)
@@ -114,50 +121,62 @@ class Results:
     Args:
         path: CSV file; the points in it are kept.
         protocol: how points are evaluated.
-        frames: of the checkpoint of each run.
+        agents: :func:`assembly.points.identity` of each run, by the name of its folder.
         overwrite: begin anew instead.
 
     Raises:
         UserError: if the file can't be continued: it is of another kind, of other settings, or
-            of another checkpoint.
+            of another agent or checkpoint.
     """
 
     def __init__(
-        self, path: Path, protocol: Protocol, frames: Mapping[str, int], *, overwrite: bool
+        self, path: Path, protocol: Protocol, agents: Mapping[str, Row], *, overwrite: bool
     ) -> None:
         self.path, self.protocol = path, protocol
-        self._points: dict[tuple[str, str], list[Row]] = {}
+        self._points: dict[tuple[str, str, str], list[Row]] = {}
         if overwrite or not path.is_file():
             return
-        again = "name another `output`, or overwrite=true begins anew."
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        if rows and not {"run", "point", "seed", "mode", "episode"} <= rows[0].keys():
-            raise UserError(f"`{path}` is no table of this command, or of an earlier one: {again}")
+        if rows and not rows[0].keys() >= _COLUMNS:
+            raise UserError(f"`{path}` is no table of this command, or of an earlier one: {_AGAIN}")
         for row in rows:
-            self._points.setdefault((row["run"], row["point"]), []).append(row)
-        for (run, point), found in self._points.items():
-            for what, given, wanted in (
-                ("seed", {row["seed"] for row in found}, protocol.seed),
-                ("frames", {row["frames"] for row in found}, frames.get(run)),
-                ("episodes", {len(found) // len({row["mode"] for row in found})},
-                 protocol.episodes),
-            ):  # fmt: skip
-                if wanted is not None and {str(value) for value in given} != {str(wanted)}:
-                    raise UserError(
-                        f"`{path}` holds {run} at {point} with {what} "
-                        f"{', '.join(sorted(map(str, given)))}, and {wanted} is asked for: {again}"
-                    )
+            key = row["run"], row["point"], row["mode"]
+            self._points.setdefault(key, []).append(row)
+        for (run, point, _), found in self._points.items():
+            self._check(run, point, found, agents.get(run, {}))
 
-    def lacks(self, run: str, point: Point) -> bool:
-        """Return whether a point of a run is to be evaluated.
+    def _check(self, run: str, point: str, found: Sequence[Row], agent: Row) -> None:
+        """Refuse episodes that another agent, or this one in another way, has made."""
+        wanted: dict[str, Any] = dict(agent) | {"seed": self.protocol.seed}
+        if found[0]["removed_by"] == "random":
+            wanted["reduction_seed"] = self.protocol.reduction_seed
+        wanted = {name: "" if value is None else str(value) for name, value in wanted.items()}
+        for name, value in wanted.items():
+            others = sorted({row[name] for row in found} - {value})
+            if others:
+                self._refuse(run, point, name, ", ".join(others) or "none", value or "none")
+        if len(found) != self.protocol.episodes:
+            self._refuse(run, point, "episodes", str(len(found)), str(self.protocol.episodes))
+
+    def _refuse(self, run: str, point: str, what: str, given: str, wanted: str) -> NoReturn:
+        raise UserError(
+            f"`{self.path}` holds {run} at {point} with {what} {given}, and {wanted} is asked "
+            f"for: {_AGAIN}"
+        )
+
+    def lacks(self, run: str, point: Point) -> list[str]:
+        """Return the kinds of action with which a point of a run is to be evaluated.
 
         Args:
             run: name of its folder.
             point: the point.
+
+        Returns:
+            Those asked for that are not in the table.
         """
-        found = self._points.get((run, point.name), [])
-        return not set(self.protocol.modes) <= {row["mode"] for row in found}
+        modes = self.protocol.modes
+        return [mode for mode in modes if (run, point.name, mode) not in self._points]
 
     def add(self, run: str, point: str, rows: Sequence[Row]) -> None:
         """Enter the episodes of a point and write the table.
@@ -165,19 +184,25 @@ class Results:
         Args:
             run: name of its folder.
             point: its name.
-            rows: of every kind of action.
+            rows: of one kind of action or more; those of others stay.
         """
-        self._points[run, point] = list(rows)
+        for mode in dict.fromkeys(row["mode"] for row in rows):
+            self._points[run, point, mode] = [row for row in rows if row["mode"] == mode]
         self.write()
 
     def arrange(self, order: Sequence[tuple[str, str]]) -> None:
         """Put points into an order, so that the table does not tell in which they came.
 
         Args:
-            order: runs and points; others that the table holds come first, as they are.
+            order: runs and points; others that the table holds come first, as they are. Of a
+                point, sampled actions come before mean ones.
         """
         ranks = {key: rank for rank, key in enumerate(order)}
-        keys = sorted(self._points, key=lambda key: ranks.get(key, -1))
+        places = {key[:2]: place for place, key in reversed(list(enumerate(self._points)))}
+        keys = sorted(
+            self._points,
+            key=lambda key: (ranks.get(key[:2], -1), places[key[:2]], key[2] != "sampled"),
+        )
         self._points = {key: self._points[key] for key in keys}
 
     def write(self) -> None:
@@ -194,12 +219,15 @@ class Results:
 # Doing the rest -------------------------------------------------------------------------------
 
 
-def evaluate_point(folder: Path, point: Point, protocol: Protocol) -> list[dict[str, Any]]:
+def evaluate_point(
+    folder: Path, point: Point, modes: Sequence[str], protocol: Protocol
+) -> list[dict[str, Any]]:
     """Evaluate one run at one point.
 
     Args:
         folder: the run folder.
         point: the point.
+        modes: kinds of action, of those of the protocol.
         protocol: how.
 
     Returns:
@@ -207,17 +235,18 @@ def evaluate_point(folder: Path, point: Point, protocol: Protocol) -> list[dict[
     """
     torch.set_num_threads(protocol.threads)
     trained = agent_of(folder)
+    drawn = {"reduction_seed": protocol.reduction_seed if point.selection == "random" else None}
     rows = []
     for _, mode, result in evaluate_points(
         trained,
         [point],
         episodes=protocol.episodes,
-        modes=protocol.modes,
+        modes=modes,
         seed=protocol.seed,
         reduction_seed=protocol.reduction_seed,
     ):
         found = episode_rows(trained, point, mode, result, run=folder.name)
-        rows += [row | {"seed": protocol.seed} for row in found]
+        rows += [row | {"seed": protocol.seed} | drawn for row in found]
     return rows
 
 
@@ -235,12 +264,12 @@ def agent_of(folder: Path) -> TrainedAgent:
 
 
 def evaluate_tasks(
-    tasks: Sequence[tuple[Path, Point]], protocol: Protocol, processes: int
+    tasks: Sequence[tuple[Path, Point, Sequence[str]]], protocol: Protocol, processes: int
 ) -> Iterator[tuple[Path, Point, list[dict[str, Any]]]]:
     """Evaluate points of runs, several at a time; the numbers do not depend on how many.
 
     Args:
-        tasks: run folders and points.
+        tasks: run folders, points and kinds of action.
         protocol: how.
         processes: at a time; 1: in this process.
 
@@ -250,8 +279,8 @@ def evaluate_tasks(
     processes = min(processes, len(tasks))
     if processes <= 1:
         agent_of.cache_clear()  # the folder may have got another checkpoint since
-        for folder, point in tasks:
-            yield folder, point, evaluate_point(folder, point, protocol)
+        for folder, point, modes in tasks:
+            yield folder, point, evaluate_point(folder, point, modes, protocol)
         return
     # A fresh interpreter each: a fork would inherit torch's threads and half-held locks.
     context = multiprocessing.get_context("spawn")
@@ -259,7 +288,8 @@ def evaluate_tasks(
         futures = {pool.submit(evaluate_point, *task, protocol): task for task in tasks}
         try:
             for future in as_completed(futures):
-                yield *futures[future], future.result()
+                folder, point, _ = futures[future]
+                yield folder, point, future.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise

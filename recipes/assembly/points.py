@@ -145,6 +145,19 @@ def _number(text: str, most: float = math.inf) -> float | None:
 # Evaluating -----------------------------------------------------------------------------------
 
 
+def check_reduction_seed(seed: Any) -> None:
+    """Check the seed of sensors that are removed at random.
+
+    Args:
+        seed: as it was given.
+
+    Raises:
+        UserError: if it is no whole number, or negative.
+    """
+    if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
+        raise UserError(f"`reduction_seed` must be a whole number of at least 0, got {seed!r}.")
+
+
 def removed_sensors(
     point: Point, trained: TrainedAgent, *, episodes: int, reduction_seed: int
 ) -> Tensor | None:
@@ -237,6 +250,28 @@ def evaluate_points(
         env.close()
 
 
+def identity(trained: TrainedAgent) -> dict[str, Any]:
+    """Return the columns that tell agents apart, whatever their folders are called.
+
+    Args:
+        trained: the agent.
+
+    Returns:
+        Columns and values.
+    """
+    settings = trained.settings
+    return {
+        "study": trained.study,
+        "env": settings.env.env_id,
+        "belief": settings.belief.get("name", ""),
+        "method": trained.method,
+        "training_seed": settings.seed,
+        "frames": trained.frames,
+        "trained_on": missingness_name(settings.missingness),
+        "trained_noise_sigma": settings.noise.sigma,
+    }
+
+
 def episode_rows(
     trained: TrainedAgent, point: Point, mode: str, result: Episodes, *, run: str = ""
 ) -> list[dict[str, Any]]:
@@ -252,16 +287,10 @@ def episode_rows(
     Returns:
         Columns and values, the same columns for every evaluation; None where a column says nothing.
     """
-    settings, missing, noise = trained.settings, point.missingness, point.noise
+    missing, noise = point.missingness, point.noise
     outages, spikes = missing.mechanism == "outages", noise.spike_probability > 0
-    common = {
-        "run": run,
-        "env": settings.env.env_id,
-        "belief": settings.belief.get("name", ""),
-        "training_seed": settings.seed,
-        "frames": trained.frames,
-        "trained_on": missingness_name(settings.missingness),
-        "trained_noise_sigma": settings.noise.sigma,
+    common = {"run": run} | identity(trained)
+    common |= {
         "point": point.name,
         "family": point.family,
         "mechanism": missing.mechanism,

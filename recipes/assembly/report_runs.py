@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from assembly.errors import UserError
+from assembly.methods import further_choices, method_name, read_cell
 from assembly.report_evaluations import Row, evaluations, mean_of_known, read_csv
-from assembly.report_variants import further_choices, variant_order
-from assembly.run_folder import CELL_FILE, read_config
+from assembly.report_variants import variant_order
+from assembly.run_folder import read_config
 from assembly.settings import Settings, missingness_name, read_settings
 
 # What may differ between the runs of one mean: it changes no number that is reported.
@@ -33,7 +34,7 @@ class StudyRun:
         episodes: rows of episodes.csv; none where it is not there.
         evaluations: rows of :func:`assembly.report_evaluations.evaluations`.
         study: the study of recipes/study.py that it is a cell of; None: it was run by itself.
-        method: what the study calls it; the belief module's name where it was run by itself.
+        method: see :func:`assembly.methods.method_name`.
         axes: its choices on axes of the study beside task, method and seed.
     """
 
@@ -261,7 +262,7 @@ def _read_run(folder: Path, name: str) -> StudyRun:
     if not training:
         raise UserError(f"`{folder}` holds no finished rollout: metrics.csv is empty.")
     path = folder / "episodes.csv"
-    study, method = _cell(folder)
+    study, choices = read_cell(folder)
     return StudyRun(
         name,
         config,
@@ -271,27 +272,9 @@ def _read_run(folder: Path, name: str) -> StudyRun:
         read_csv(path, {"frames", "return"}) if path.is_file() else [],
         evaluations(folder, settings),
         study,
-        method or _method(settings),
-        further_choices(folder),
+        method_name(settings, choices),
+        further_choices(choices),
     )
-
-
-def _method(settings: Settings) -> str:
-    """Name a run that is no cell of a study: its belief, and its algorithm where it is not PPO."""
-    belief, algo = str(settings.belief.get("name", "")), str(settings.algo.get("name", ""))
-    return belief if algo == "ppo" else f"{belief} ({algo})"
-
-
-def _cell(folder: Path) -> tuple[str | None, str | None]:
-    """Return study and method of a run that is a cell of a study."""
-    path = folder / CELL_FILE
-    if not path.is_file():
-        return None, None
-    try:
-        cell = json.loads(path.read_text(encoding="utf-8"))
-        return str(cell["study"]), cell["choices"].get("method")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"`{path}` can't be read: remove it, or run the cell again.") from error
 
 
 def _read_versions(folder: Path) -> dict[str, str]:

@@ -2,34 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 from assembly.report_evaluations import Row
-from assembly.run_folder import CELL_FILE
 
-# Axes that a report knows by themselves: a mean is taken over seeds, within a task and a method.
-_USUAL = ("task", "method", "seed")
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
-
-
-def further_choices(folder: Path) -> dict[str, str]:
-    """Return which choices a cell of a study takes on axes beside task, method and seed.
-
-    Args:
-        folder: a run folder whose cell.json, where it has one, can be read.
-
-    Returns:
-        Choices by axis, such as ``{"rate": "lr1e-3"}``; none for a run that is no cell.
-    """
-    path = folder / CELL_FILE
-    if not path.is_file():
-        return {}
-    choices: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))["choices"]
-    return {str(axis): str(name) for axis, name in choices.items() if axis not in _USUAL}
 
 
 def variant_order(variant: str) -> tuple[tuple[str, ...], tuple[float, ...]]:

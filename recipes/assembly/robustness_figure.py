@@ -12,12 +12,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from assembly.belief_figure import STYLE
+from assembly.methods import training_labels
 
 _COLOURS = ("#1f6fb4", "#d1622b", "#3a923a", "#8d5aa8", "#7f6a4f", "#c44e7f", "#5f6b73")
 _LINES = ("-", "--", ":", "-.")
 _PANEL = (3.4, 3.1)  # inches
 _RESAMPLES = 2000
 _NUMBERS = (
+    "trained_noise_sigma",
     "eta",
     "mean_length",
     "removed_ratio",
@@ -34,19 +36,19 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of one panel: a belief under one family of corruption, by level.
+    """One line of one panel: a method under one family of corruption, by level.
 
     Attributes:
         panel: title of the panel.
         axis: what the level is, for its axis.
-        belief: name, and what it was trained on where that differs within the task.
-        variant: what tells curves of one belief in one panel apart; may be empty.
+        method: name, and what it was trained on where that differs within the task.
+        variant: what tells curves of one method in one panel apart; may be empty.
         rows: the episodes of each level.
     """
 
     panel: str
     axis: str
-    belief: str
+    method: str
     variant: str
     rows: dict[float, list[Row]]
 
@@ -85,7 +87,10 @@ def draw_robustness(rows: Sequence[Row]) -> dict[str, Figure]:
     for task in dict.fromkeys(row["env"] for row in rows):
         own = [row for row in rows if row["env"] == task]
         modes = list(dict.fromkeys(row["mode"] for row in own))
-        curves = {mode: _curves([row for row in own if row["mode"] == mode]) for mode in modes}
+        labels = training_labels(map(_kind, own))
+        curves = {
+            mode: _curves([row for row in own if row["mode"] == mode], labels) for mode in modes
+        }
         panels = list(dict.fromkeys(c.panel for found in curves.values() for c in found))
         if panels:
             figures[str(task)] = _draw(str(task), modes, panels, curves)
@@ -116,23 +121,26 @@ def mean_interval(values: Sequence[Sequence[float]], seed: int = 0) -> tuple[flo
     return float(np.mean([run.mean() for run in runs])), float(low), float(high)
 
 
-def _curves(rows: Sequence[Row]) -> list[Curve]:
+def _kind(row: Row) -> tuple[str, str, float]:
+    return row["method"], row["trained_on"], row["trained_noise_sigma"]
+
+
+def _curves(rows: Sequence[Row], labels: Mapping[tuple[str, str, float], str]) -> list[Curve]:
     """Sort the episodes of a kind of action into curves of two levels or more."""
-    several = len({row["trained_on"] for row in rows}) > 1
     curves: dict[tuple[str, str, str], Curve] = {}
     clean: dict[str, list[Row]] = {}
     for row in rows:
-        belief = f"{row['belief']}, {row['trained_on']}" if several else str(row["belief"])
+        method = labels[_kind(row)]
         if row["family"] == "none":
-            clean.setdefault(belief, []).append(row)
+            clean.setdefault(method, []).append(row)
             continue
         panel, axis, variant, level = _place(row)
-        curve = curves.setdefault((panel, belief, variant), Curve(panel, axis, belief, variant, {}))
+        curve = curves.setdefault((panel, method, variant), Curve(panel, axis, method, variant, {}))
         curve.rows.setdefault(level, []).append(row)
     for curve in curves.values():
         # With nothing missing every family of ratios is the same.
-        if curve.axis == "nominal missing ratio" and curve.belief in clean:
-            curve.rows.setdefault(0.0, clean[curve.belief])
+        if curve.axis == "nominal missing ratio" and curve.method in clean:
+            curve.rows.setdefault(0.0, clean[curve.method])
     return [curve for curve in curves.values() if len(curve.rows) > 1]
 
 
@@ -156,7 +164,7 @@ def _place(row: Row) -> tuple[str, str, str, float]:
 def _draw(
     task: str, modes: Sequence[str], panels: Sequence[str], curves: Mapping[str, Sequence[Curve]]
 ) -> Figure:
-    beliefs = list(dict.fromkeys(c.belief for found in curves.values() for c in found))
+    methods = list(dict.fromkeys(c.method for found in curves.values() for c in found))
     with mpl.rc_context(STYLE):
         size = (_PANEL[0] * len(panels), _PANEL[1] * len(modes) + 0.4)
         figure = Figure(figsize=size, layout="constrained")
@@ -165,7 +173,7 @@ def _draw(
             for axis, panel in zip(line, panels, strict=True):
                 found = [curve for curve in curves[mode] if curve.panel == panel]
                 if found:
-                    _draw_panel(axis, found, beliefs)
+                    _draw_panel(axis, found, methods)
                 axis.set_title(panel)
             line[0].set_ylabel(f"raw return, {mode} actions")
         figure.suptitle(
@@ -174,14 +182,14 @@ def _draw(
     return figure
 
 
-def _draw_panel(axis: Any, curves: Sequence[Curve], beliefs: Sequence[str]) -> None:
+def _draw_panel(axis: Any, curves: Sequence[Curve], methods: Sequence[str]) -> None:
     variants = list(dict.fromkeys(curve.variant for curve in curves))
     for curve in curves:
         levels = sorted(curve.rows)
         ends = np.array([mean_interval(_by_run(curve.rows[level])) for level in levels])
-        colour = _COLOURS[beliefs.index(curve.belief) % len(_COLOURS)]
+        colour = _COLOURS[methods.index(curve.method) % len(_COLOURS)]
         runs = len({row["run"] for found in curve.rows.values() for row in found})
-        label = ", ".join(part for part in (curve.belief, curve.variant) if part)
+        label = ", ".join(part for part in (curve.method, curve.variant) if part)
         axis.plot(
             levels,
             ends[:, 0],

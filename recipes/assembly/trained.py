@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,9 +10,11 @@ from torchrl.envs import TransformedEnv
 
 from assembly.agent import Agent, add_primers
 from assembly.beliefs import Belief
-from assembly.checkpoint import last_checkpoint, load_checkpoint
+from assembly.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
+from assembly.console import say
 from assembly.environment import make_environment
 from assembly.errors import UserError
+from assembly.methods import method_label, read_cell
 from assembly.run_folder import read_config
 from assembly.settings import Settings, read_settings
 from assembly.training import make_agent
@@ -27,6 +30,8 @@ class TrainedAgent:
         agent: with the trained weights.
         statistics: an environment that holds the trained normalisation.
         frames: environment steps of the checkpoint.
+        method: what it is called in tables and figures, see :mod:`assembly.methods`.
+        study: the study that it is of; None: it was trained by itself.
     """
 
     settings: Settings
@@ -34,6 +39,8 @@ class TrainedAgent:
     agent: Agent
     statistics: TransformedEnv
     frames: int
+    method: str
+    study: str | None
 
 
 def load_trained_agent(folder: Path) -> TrainedAgent:
@@ -72,4 +79,24 @@ def load_trained_agent(folder: Path) -> TrainedAgent:
         raise UserError(
             f"`{path}` does not fit {folder / 'config.yaml'}: {' '.join(str(error).split())[:300]}"
         ) from error
-    return TrainedAgent(settings, belief, agent, statistics, frames)
+    study, choices = read_cell(folder)
+    method = method_label(settings, choices)
+    return TrainedAgent(settings, belief, agent, statistics, frames, method, study)
+
+
+def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
+    """Leave out runs that have not got to their first checkpoint, and say so.
+
+    Args:
+        folders: run folders.
+
+    Returns:
+        Those with a checkpoint; all, where none has one: reading the first says what is wrong.
+    """
+    found = [folder for folder in folders if checkpoint_frames(folder) is not None]
+    if not found:
+        return list(folders)
+    for folder in folders:
+        if folder not in found:
+            say(f"{folder.name}: left out, it has no checkpoint yet")
+    return found
