@@ -1,7 +1,8 @@
 """What a method is called, and that figures never pool two of them.
 
 A cell of a study has the study's name for its method, any other run its belief's and what sets it
-apart. The figure of an evaluation draws two methods as two curves, and two levels of training noise.
+apart. The figure of an evaluation draws two methods, and two levels of the noise in training, as
+two curves.
 """
 
 from __future__ import annotations
