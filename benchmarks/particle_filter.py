@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from timing import finish, interleave, parser, start, table
+from timing import CLOCKS, finish, interleave, parser, start, table
 from torchrl.modules import GRUModule, set_recurrent_mode
 
 from torchrl_drbpn import BeliefFilter, BeliefFilterModule, ParticleFilter, ParticleFilterModule
@@ -97,7 +97,13 @@ def main() -> None:
         data = make_data(time, batch, obs)
         modules = make_modules(obs, particles, quick=args.quick)
         calls = {name: candidate(module, data) for name, module in modules.items()}
-        times = interleave(calls, rounds=rounds, warmup=1)
+        times = interleave(
+            calls,
+            rounds=rounds,
+            warmup=1,
+            sample_seconds=0.0 if args.quick else 0.1,
+            clock=CLOCKS[args.clock],
+        )
         table(
             f"time {time} x batch {batch}, obs {obs}: forward + backward",
             ("", "ms", "+-", f"/ {BASE}"),
