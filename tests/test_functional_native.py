@@ -9,7 +9,8 @@ test_functional_filtering.py. Specified here:
 - one covariance that cannot be factorised spoils its own row, no other;
 - a step without a gradient runs it too; under torch.func and with a gradient PyTorch runs;
 - without a compiler, with one that fails, or switched off: "auto" runs PyTorch and "native" says
-  why it cannot; a library that was compiled once is not compiled again.
+  why it cannot; a library that was compiled once is not compiled again until its source, or a
+  file that this includes, is another.
 """
 
 from __future__ import annotations
@@ -136,6 +137,19 @@ def test_a_library_is_compiled_once(forgetful):
     assert compiled.native_error(torch.float64) is None
     assert [p for p in forgetful.rglob("*") if p.is_file()] == [library]
     assert library.stat().st_mtime_ns == written
+
+
+def test_a_change_in_an_included_file_compiles_anew(forgetful, monkeypatch):
+    folder = forgetful / "source"
+    folder.mkdir()
+    monkeypatch.setattr(compiled, "_FOLDER", folder)
+    (folder / "native.c").write_text('#include "outer.h"\nint answer(void) { return ANSWER; }\n')
+    (folder / "outer.h").write_text('#include <math.h>\n#include "inner.h"\n')
+    for answer in (1, 2):
+        (folder / "inner.h").write_text(f"#define ANSWER {answer}\n")
+        compiled.load_library.cache_clear()
+        assert compiled.load_library(torch.float32).answer() == answer
+    assert len(list(forgetful.rglob("*.so"))) == 2
 
 
 def test_what_it_does_not_take_it_names():

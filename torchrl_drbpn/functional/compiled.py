@@ -1,9 +1,10 @@
 """The C code of the package: compiled once for a machine, when it is first used.
 
 The C compiler is the one named in ``CC`` or found on the path; the library goes into the user's
-cache folder (``XDG_CACHE_HOME``, else ``~/.cache``), under a name that holds its source, the
-compiler's command and the width of the processor's vectors. ``TORCHRL_DRBPN_NATIVE=0`` switches it
-off. Where it cannot be had, every function of the package runs in PyTorch.
+cache folder (``XDG_CACHE_HOME``, else ``~/.cache``), under a name that holds its source, what that
+includes from here, the compiler's command and the width of the processor's vectors.
+``TORCHRL_DRBPN_NATIVE=0`` switches it off. Where it cannot be had, every function of the package
+runs in PyTorch.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import functools
 import hashlib
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -24,7 +26,7 @@ from torch import Tensor
 
 __all__ = ["NativeError", "load_library", "native_error", "spd_inverse"]
 
-# native.c is the filter, moments.c the running statistics.
+# native.c, with the pieces native_*.h, is the filter, moments.c the running statistics.
 _FOLDER = Path(__file__).parent
 _MAX_SIZE = 64  # a group of matrices stays in cache up to here
 _REALS = {torch.float32: "float", torch.float64: "double"}
@@ -68,7 +70,7 @@ def load_library(dtype: torch.dtype, source: str = "native") -> ctypes.CDLL:
     flags = [*_FLAGS, *_MACHINE_FLAGS.get(torch.backends.cpu.get_cpu_capability(), [])]
     command = [*compiler, *flags, *_OWN_FLAGS.get(source, []), f"-DREAL={_REALS[dtype]}"]
     file = _FOLDER / f"{source}.c"
-    text = "\n".join([*command, platform.machine(), file.read_text(encoding="utf-8")])
+    text = "\n".join([*command, platform.machine(), *_texts(file)])
     name = f"{source}-{_REALS[dtype]}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.so"
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     path = Path(cache) / "torchrl_drbpn" / name
@@ -90,6 +92,13 @@ def load_library(dtype: torch.dtype, source: str = "native") -> ctypes.CDLL:
         return ctypes.CDLL(str(path))
     except OSError as error:
         raise NativeError(f"it could not be built or loaded: {error}") from error
+
+
+def _texts(file: Path) -> list[str]:
+    """Return the text of a C file and of those of this folder that it includes."""
+    text = file.read_text(encoding="utf-8")
+    pieces = re.findall(r'^#include "(.+)"', text, re.MULTILINE)
+    return [text, *(own for piece in pieces for own in _texts(file.parent / piece))]
 
 
 @functools.cache

@@ -1,9 +1,9 @@
 """The fast forms in C: one call forward and one back, not some hundred operations each.
 
 At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
-time between the operations of the filter, not in them. ``native.c`` holds the same sums as
-:class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and
-:class:`~torchrl_drbpn.functional.recurrence.InformationRecurrence` and is held to the same oracles.
+time between the operations of the filter, not in them. ``native.c`` and the files that it includes
+hold the same sums as :class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and
+:class:`~torchrl_drbpn.functional.recurrence.InformationRecurrence` and are held to the same oracles.
 :mod:`.compiled` compiles it; where it cannot, the PyTorch forms run.
 """
 
