@@ -5,11 +5,15 @@ one thing: the exact filter propagates its covariance (P = A Sigma A' + Q), the 
 the same P at every step, as eq. (8) of the paper does, and that P is trained by likelihood on data
 with the same gaps. MSE of the state over the exact filter's; NEES / n and NIS / entries, 1 for a
 filter that is as sure as it should be. Sensors fail one by one, independently at every step or for
-20 steps on average, or all at once. Plus-minus: 1.96 standard errors over independent sequences.
+20 steps on average, or all at once. Each sensor shows one component of the state, so NEES is told by
+the steps since a component was last seen as well, as diagnose.py tells NIS: of the sub-vector of the
+components in a class, missing ones and those that have just arrived apart. Plus-minus: 1.96
+standard errors over independent sequences.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -31,6 +35,9 @@ from torchrl_drbpn.functional import (
 )
 
 STATE, MIN_STD = 4, 1e-3
+# Where the classes of steps since last seen begin, those of conf/diagnose.yaml.
+BINS = (1, 2, 3, 4, 5, 6, 11, 21, 51)
+FEWEST = 30  # components of a class that is told
 CASES = {
     "each sensor, 50 % of the steps, independent": (0.5, 2.0, False),
     "each sensor, 50 %, outages of mean length 20": (0.5, 20.0, False),
@@ -112,10 +119,17 @@ def trained_cov(
     return full_cov(raw, MIN_STD).detach()
 
 
+def class_names() -> list[str]:
+    """Name the classes of components: 0 for those that have just arrived."""
+    ends = itertools.pairwise(BINS)
+    within = [str(low) if high == low + 1 else f"{low}-{high - 1}" for low, high in ends]
+    return ["0", *within, f"{BINS[-1]}+", "never"]
+
+
 def judge(
     model: StateSpace, cov: Tensor | None, state: Tensor, observation: Tensor, observed: Tensor
 ) -> dict[str, Tensor]:
-    """Filter with a constant P, or exactly, and return sums for each sequence."""
+    """Filter with a constant P, or exactly, and return sums for each sequence (and class)."""
     rows, time = observed.shape[:2]
     A, R = dynamics(model), model.full_emission_cov()
     Q = model.transition_cov if cov is None else cov
@@ -125,6 +139,11 @@ def judge(
         model.initial_mean.expand(rows, -1), model.initial_cov.expand(rows, STATE, STATE)
     )
     sums = {name: torch.zeros(rows, dtype=torch.float64) for name in ("se", "nees", "nis", "dof")}
+    never = len(BINS) + 1
+    for name in ("nees by class", "components by class"):
+        sums[name] = torch.zeros(rows, never + 1, dtype=torch.float64)
+    edges, since = torch.tensor(BINS), torch.zeros(rows, STATE, dtype=torch.int64)
+    ever = torch.zeros(rows, STATE, dtype=torch.bool)
     for t in range(time):
         if t:
             belief = predict(
@@ -138,6 +157,13 @@ def judge(
         error = state[:, t] - belief.mean
         sums["se"] += error.square().sum(-1)
         sums["nees"] += normalised_squared(error, belief.cov)
+        gap = torch.bucketize(since + 1, edges, right=True)
+        kind = torch.where(seen, 0, torch.where(ever, gap, never))
+        ever, since = ever | seen, torch.where(seen, 0, since + 1)
+        for index in kind.unique().tolist():
+            chosen = kind == index
+            sums["nees by class"][:, index] += normalised_squared(error, belief.cov, chosen)
+            sums["components by class"][:, index] += chosen.sum(-1)
     return sums | {"entries": torch.full((rows,), float(STATE * time), dtype=torch.float64)}
 
 
@@ -149,6 +175,16 @@ def ratio(numerator: Tensor, denominator: Tensor) -> tuple[float, float]:
     return value.item(), 1.96 * error.item()
 
 
+def by_class(found: dict[str, Tensor]) -> dict[str, tuple[float, float]]:
+    """Return NEES over components of every class that the data holds."""
+    nees, count = found["nees by class"], found["components by class"]
+    return {
+        name: ratio(nees[:, i], count[:, i])
+        for i, name in enumerate(class_names())
+        if count[:, i].sum() >= FEWEST
+    }
+
+
 def main() -> None:
     """Run from the command line."""
     args = parser(__doc__ or "").parse_args()
@@ -156,6 +192,7 @@ def main() -> None:
     rows, time, iterations = (8, 20, 3) if args.quick else (200, 200, 200)
     model = system()
     results: dict[str, dict[str, tuple[float, float]]] = {}
+    classes: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
     for name, case in CASES.items():
         _, observation, observed = simulate(model, case, rows, time, seed=0)
         cov = trained_cov(model, observation, observed, iterations)
@@ -168,6 +205,7 @@ def main() -> None:
             "nis constant": ratio(constant["nis"], constant["dof"]),
             "nis exact": ratio(exact["nis"], exact["dof"]),
         }
+        classes[name] = {"constant": by_class(constant), "exact": by_class(exact)}
     for title, keys in {
         "state MSE, constant over exact": ("mse",),
         "NEES / n": ("nees constant", "nees exact"),
@@ -178,7 +216,13 @@ def main() -> None:
             (name, *(v for key in keys for v in found[key])) for name, found in results.items()
         ]
         table(title, ("sensors fail", *columns), lines)
-    finish(args, run, results)
+    for name, found in classes.items():
+        table(
+            f"NEES / n by steps since last seen, {name}",
+            ("steps", "constant", "+-", "exact", "+-"),
+            [(step, *found["constant"][step], *found["exact"][step]) for step in found["exact"]],
+        )
+    finish(args, run, {"together": results, "by steps since last seen": classes})
 
 
 if __name__ == "__main__":

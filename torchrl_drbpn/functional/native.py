@@ -3,7 +3,7 @@
 At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
 time between the operations of the filter, not in them. ``native.c`` and the files that it includes
 hold the same sums as :class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and
-:class:`~torchrl_drbpn.functional.recurrence.InformationRecurrence` and are held to the same oracles.
+:class:`~torchrl_drbpn.functional.recurrence.InformationRecurrence` and are held to their oracles.
 :mod:`.compiled` compiles it; where it cannot, the PyTorch forms run.
 """
 
