@@ -5,9 +5,9 @@ one thing: the exact filter propagates its covariance (P = A Sigma A' + Q), the 
 the same P at every step, as eq. (8) of the paper does, and that P is trained by likelihood on data
 with the same gaps. MSE of the state over the exact filter's; NEES / n and NIS / entries, 1 for a
 filter that is as sure as it should be. Sensors fail one by one, independently at every step or for
-20 steps on average, or all at once. Each sensor shows one component of the state, so NEES is told by
-the steps since a component was last seen as well, as diagnose.py tells NIS: of the sub-vector of the
-components in a class, missing ones and those that have just arrived apart. Plus-minus: 1.96
+20 steps on average, or all at once. Each sensor shows one component of the state, so NEES / n is
+told by the steps since a component was last seen as well, in the classes of diagnose.py: of the
+sub-vector of the components in a class, 0 for those that have just arrived. Plus-minus: 1.96
 standard errors over independent sequences.
 """
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from assembly.diagnosis import ARRIVED, COVERAGE, LEVELS, Forecast, Tally
+from assembly.diagnosis import ARRIVED, COVERAGE, LEVELS, Tally
 from torchrl_drbpn.functional import chi_square_quantile
 
 ALL = "all"
@@ -168,31 +168,6 @@ def reliability_rows(tally: Tally) -> Iterator[dict[str, Any]]:
             "entries": forecast.entries,
             "count": int(total),
         } | {f"under_{100 * p:g}": share for p, share in zip(LEVELS, shares, strict=True)}
-
-
-def nis_curve(
-    tally: Tally, forecast: Forecast, *, fewest: int, resamples: int, seed: int
-) -> list[tuple[str, float, float | None, float | None]]:
-    """Return NIS over degrees of freedom by class, for a figure.
-
-    Args:
-        tally: of agents at a point.
-        forecast: which.
-        fewest: entries; a class with fewer is left out.
-        resamples: for the intervals.
-        seed: of them.
-
-    Returns:
-        Class, number and ends of its interval.
-    """
-    resampling = Resampling(len(tally.lengths), resamples, seed)
-    sums, out = tally.honesty[forecast], []
-    for index, name in enumerate(tally.classes):
-        count = sums["count"][:, index]
-        value, low, high = resampling.ratio(sums["nis"][:, index], count)
-        if value is not None and count.sum() >= fewest:
-            out.append((name, value, low, high))
-    return out
 
 
 def _classes(tally: Tally, sums: Mapping[str, Tensor]) -> Iterator[tuple[str, int | None]]:
