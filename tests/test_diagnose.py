@@ -27,6 +27,7 @@ from assembly import diagnosis
 from assembly.beliefs import ESTIMATE, FORECAST, FORECAST_COV
 from assembly.checkpoint import save_checkpoint
 from assembly.diagnosis import Forecast, Tally, class_names, pool
+from assembly.diagnosis_figures import Series, draw_outages, outage_figure, read_outages
 from assembly.diagnosis_tables import (
     Resampling,
     calibration_rows,
@@ -36,10 +37,12 @@ from assembly.diagnosis_tables import (
 from assembly.environment import copy_statistics
 from assembly.errors import UserError
 from assembly.evaluation import make_evaluation_environment
-from assembly.run_folder import write_config
+from assembly.report_page import csv_cells
+from assembly.run_folder import write_config, write_table
 from assembly.settings import read_settings
 from assembly.trained import TrainedAgent, load_trained_agent
 from assembly.training import assemble, train_rollout, training_state
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
@@ -353,6 +356,90 @@ def test_the_truth_is_before_the_noise_and_readings_are_after_it(
     (norm,) = [t for t in trained.statistics.transform if hasattr(t, "denormalize")]
     expected = (noise / norm.scale).square().mean().sqrt().item()
     assert rmse == pytest.approx(expected, rel=0.5)
+
+
+# The outage figure -----------------------------------------------------------------------------
+
+
+def curves(figure: Figure) -> list[list[tuple[list[float], list[float]]]]:
+    """What stands in each panel."""
+    return [
+        [(list(line.get_xdata()), list(line.get_ydata())) for line in axis.get_lines()]
+        for axis in figure.axes
+    ]
+
+
+def test_the_outage_figure_shows_nis_coverage_and_crps_of_every_class() -> None:
+    tally = known_forecasts(0.5)
+    series = Series("Task-v5", "mcar:0.4", "sure", "none", 1, tally)
+    figure = outage_figure([series], resamples=20, seed=0)
+    assert figure is not None
+    nis, coverage, crps = curves(figure)
+    rows = {
+        row["steps_since_seen"]: row
+        for row in calibration_rows(tally, resamples=20, seed=0)
+        if row["held_against"] == "reading"
+    }
+    shown = [name for name in tally.classes[:-1] if rows[name]["count"] >= 30]
+    assert shown == tally.classes[:-1]
+    for panel, name in ((nis, "nis_per_dof"), (coverage, "coverage_95"), (crps, "crps")):
+        assert panel[0][1] == pytest.approx([rows[c][name] for c in shown])
+        assert panel[1][1] == pytest.approx([rows["never"][name]])
+    # Half the deviation is claimed: NIS 4, and 67.3 % inside (see above).
+    assert nis[0][1][0] == pytest.approx(4, rel=0.1)
+    assert coverage[0][1][0] == pytest.approx(0.673, abs=0.03)
+    assert [axis.get_ylabel().split()[0] for axis in figure.axes] == ["NIS", "share", "CRPS,"]
+
+
+def test_the_outage_figure_is_the_same_from_the_table(tmp_path: Path) -> None:
+    kinds = {"right": known_forecasts(1.0), "sure": known_forecasts(0.5)}
+    options = {"resamples": 20, "seed": 0}
+    common = {"task": "Task-v5", "point": "mcar:0.4", "trained_on": "none"}
+    rows = [
+        {"run": name, "belief": name, "missing_ratio": tally.missing_ratio, **common, **row}
+        for name, tally in kinds.items()
+        for row in calibration_rows(tally, **options)
+    ]
+    write_table(tmp_path / "calibration.csv", csv_cells(rows))
+    series = [Series("Task-v5", "mcar:0.4", n, "none", 1, t) for n, t in kinds.items()]
+    first = outage_figure(series, **options)
+    second = draw_outages(read_outages(tmp_path / "calibration.csv"))
+    assert first is not None
+    assert second is not None
+    for one, other in zip(curves(first), curves(second), strict=True):
+        for (x, y), (x2, y2) in zip(one, other, strict=True):
+            assert x == x2
+            assert y == pytest.approx(y2, rel=1e-5)
+    titles = [[axis.get_title(loc="left") for axis in f.axes] for f in (first, second)]
+    assert titles[0] == titles[1]
+
+
+def test_runs_of_one_kind_in_a_table_are_pooled_by_their_entries(tmp_path: Path) -> None:
+    tally = known_forecasts(1.0)
+    (row,) = [
+        r
+        for r in calibration_rows(tally, resamples=20, seed=0)
+        if r["held_against"] == "reading" and r["steps_since_seen"] == "1"
+    ]
+    common = {"task": "Task-v5", "point": "p", "belief": "drbpn", "trained_on": "none"}
+    rows = [
+        {"run": "a", "missing_ratio": 0.2, **common, **row, "count": 300, "crps": 1.0},
+        {"run": "b", "missing_ratio": 0.4, **common, **row, "count": 100, "crps": 5.0},
+    ]
+    write_table(tmp_path / "calibration.csv", csv_cells(rows))
+    (pooled,) = read_outages(tmp_path / "calibration.csv")
+    assert (pooled.runs, pooled.missing_ratio) == (2, pytest.approx(0.3))
+    (only,) = pooled.rows
+    assert only["crps"] == pytest.approx(2.0)
+    assert only["crps_low"] is None
+
+
+def test_without_forecasts_of_what_arrives_there_is_no_outage_figure() -> None:
+    observed = torch.ones(1, 6, 1, dtype=torch.bool)
+    tally = Tally(class_names(BINS), torch.tensor([6.0]), torch.tensor([6.0]), 1)
+    diagnosis._add(tally, steps_with(observed))
+    series = [Series("Task-v5", "none:0", "fill", "none", 1, tally)]
+    assert outage_figure(series, resamples=2, seed=0) is None
 
 
 # The command -----------------------------------------------------------------------------------
