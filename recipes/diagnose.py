@@ -19,8 +19,10 @@ from assembly.console import say, start
 from assembly.diagnosis import Tally, class_names, diagnose, pool
 from assembly.diagnosis_figures import (
     Series,
+    draw_outages,
     outage_figure,
     precision_figure,
+    read_outages,
     reliability_figure,
 )
 from assembly.diagnosis_tables import calibration_rows, precision_rows, reliability_rows
@@ -47,6 +49,8 @@ def run(config: dict[str, Any]) -> int:
     Returns:
         The exit status.
     """
+    if config["redraw"] is not None:
+        return _redraw(Path(config["redraw"]))
     if config["run"] is None:
         raise UserError("`run` must name run folders: run=<folder> or 'run=runs/*'.")
     check_mode(config["mode"])
@@ -98,6 +102,21 @@ def run(config: dict[str, Any]) -> int:
         else:
             save_figure(figure, out / name, dpi=100)
     say(f"{len(folders)} run{'s' if len(folders) > 1 else ''}, written: {out}")
+    return 0
+
+
+def _redraw(folder: Path) -> int:
+    """Draw the outage figure of a diagnosis anew from its table."""
+    table, path = folder / "calibration.csv", folder / _FIGURES[1]
+    if not table.is_file():
+        raise UserError(
+            f"`redraw` must be the folder of a diagnosis, {folder} has no {table.name}."
+        )
+    figure = draw_outages(read_outages(table))
+    if figure is None:
+        raise UserError(f"`{table}` holds no reading that was held against a forecast.")
+    save_figure(figure, path, dpi=100)
+    say(f"written: {path}")
     return 0
 
 

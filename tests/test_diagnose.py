@@ -50,6 +50,7 @@ BINS = [1, 2, 3, 6]
 BELIEFS = ("drbpn", "gru", "gru_action", "fill", "none", "dvrl", "transformer")
 READINGS = Forecast("predicted", True, "reading", "arrived")
 DEFAULTS: dict[str, Any] = {
+    "redraw": None,
     "points": ["trained"],
     "episodes": 2,
     "mode": "sampled",
@@ -473,6 +474,11 @@ def test_the_command_leaves_tables_and_figures_and_says_who_has_no_estimate(
     for name in diagnose._FIGURES:
         pixels = imread(tmp_path / "study" / name)[..., :3]
         assert 0.01 < (pixels.min(-1) < 0.9).mean() < 0.9
+    figure = tmp_path / "study" / "outages.png"
+    first = imread(figure)
+    figure.unlink()
+    assert run(None, None, redraw=str(tmp_path / "study")) == 0
+    assert imread(figure).shape == first.shape
 
 
 def test_the_same_seed_gives_the_same_bytes_beside_the_run_where_no_folder_is_named(
@@ -537,6 +543,7 @@ def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(
     [
         ({"run": None}, "`run` must name run folders"),
         ({"run": "nowhere"}, "there is no folder nowhere"),
+        ({"redraw": "nowhere"}, "nowhere has no calibration.csv"),
         ({"points": []}, "`points` must hold at least one"),
         ({"points": ["mcar:2"]}, "`points` must hold"),
         ({"mode": "best"}, "`modes` must hold"),

@@ -165,7 +165,9 @@ def read_outages(path: Path) -> list[Outages]:
     classes = sorted({row["steps_since_seen"] for row in table} - {ALL}, key=_first_step)
     kinds: dict[tuple[str, str, str, str], list[dict[str, str]]] = {}
     for row in table:
-        kind = (row["task"], row["point"], row["belief"], row["trained_on"])
+        # Tables of the first studies name the belief alone.
+        method = row.get("method", row["belief"])
+        kind = (row["task"], row["point"], method, row["trained_on"])
         kinds.setdefault(kind, []).append(row)
     out = []
     for kind, rows in kinds.items():
