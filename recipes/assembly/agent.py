@@ -152,7 +152,8 @@ class _SideBySide(nn.Sequential):
     """A network of several inputs, joined in their last dimension."""
 
     def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
-        return super().forward(torch.cat(inputs, -1))
+        joined = torch.cat(inputs, -1)
+        return super().forward(joined)  # type: ignore[no-untyped-call]
 
 
 def _mlp(sizes: list[int], hidden_gain: float, last_gain: float) -> nn.Sequential:

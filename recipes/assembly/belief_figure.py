@@ -20,7 +20,7 @@ TRUTH, ARRIVED, BELIEF, MISSING = "#222222", "#111111", "#1f77c4", "#f8ddd2"
 ABSENT = "#e3997f"  # an entry of a mask that did not arrive
 DASHES = (0, (3, 1.5))
 _WIDTH_INCHES, _PANEL_INCHES, _STRIP_INCHES, _MASK_INCHES = 10.0, 1.05, 1.55, 0.75
-STYLE = {
+STYLE: Any = {
     "font.size": 9.5,
     "axes.spines.top": False,
     "axes.spines.right": False,

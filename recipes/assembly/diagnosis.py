@@ -311,7 +311,8 @@ def _add_forecast(
         error, cov = value - mean, steps["predicted cov"]
         part["nis_joint"] = normalised_squared(error, cov, mask).sum(-1, keepdim=True)
         part["nis"] = torch.zeros_like(part["count"])
-        for index in steps["class"][mask].unique().tolist():
+        present = torch.unique(steps["class"][mask])
+        for index in present.tolist():
             # What arrived of one class is a Gaussian vector of its own: rows of the whole one.
             chosen = mask & (steps["class"] == index)
             part["nis"][:, index] = normalised_squared(error, cov, chosen).sum(-1)

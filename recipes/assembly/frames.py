@@ -75,7 +75,7 @@ def render_poses(
             if not sky:
                 picture[np.asarray(viewer.render("depth_array")) >= _FAR] = 255
             pictures.append(picture)
-        viewer.close()
+        viewer.close()  # type: ignore[no-untyped-call]
     except Exception as error:  # each OpenGL back end fails in its own way
         reason = " ".join(str(error).split()) or type(error).__name__
         raise RuntimeError(reason[:200]) from error

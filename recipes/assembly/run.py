@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from torchrl.envs import TransformedEnv
 from torchrl.record.loggers import get_logger
 from torchrl.record.loggers.common import Logger
@@ -145,7 +146,7 @@ class _Run:
         before = progress.frames
         try:
             row, finished = train_rollout(self.training, self.settings)
-        except (BeliefDivergedError, torch.linalg.LinAlgError) as error:
+        except (BeliefDivergedError, LinAlgError) as error:
             raise UserError(
                 f"training diverged at {before:,} steps: {error} The last checkpoint is in "
                 f"{self.folder}; a lower optim.lr starts anew."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -133,7 +133,11 @@ def _draw_curves(axes: Sequence[Any], models: Sequence[SensorModel], orders: tor
         low, high = np.quantile(random, _BAND, axis=0)
         axis.fill_between(count, low, high, color=_RANDOM, alpha=0.35, lw=0)
         axis.plot(count, random.mean(0), color=_RANDOM, lw=1.2)
-        for criterion, colour, dashes in (("A", _A, (0, (4, 2))), ("D", _D, "-")):
+        looks: tuple[tuple[Literal["D", "A"], str, Any], ...] = (
+            ("A", _A, (0, (4, 2))),
+            ("D", _D, "-"),
+        )
+        for criterion, colour, dashes in looks:
             seeds = [curves(model, model.ranking(criterion)) for model in models]
             for seed in seeds:
                 axis.plot(count, seed, color=colour, lw=0.7, alpha=0.45)
@@ -153,15 +157,15 @@ def _draw_ranking(axis: Any, models: Sequence[SensorModel]) -> None:
         order = model.ranking("D")
         gain = model.along(order)[0].diff(prepend=torch.zeros(1, dtype=torch.float64))
         gains.append(gain[order.argsort()].numpy())
-    gain = np.array(gains)  # seeds, sensors
+    added = np.array(gains)  # seeds, sensors
     shown = np.argsort(places, kind="stable")
     rows = np.arange(len(shown))
-    axis.barh(rows, gain.mean(0)[shown], color=_D, alpha=0.55, height=0.72)
-    for seed in gain:
-        axis.plot(seed[shown], rows, ".", color=_D, ms=4, mew=0)
+    axis.barh(rows, added.mean(0)[shown], color=_D, alpha=0.55, height=0.72)
+    for own in added:
+        axis.plot(own[shown], rows, ".", color=_D, ms=4, mew=0)
     axis.set_yticks(rows, [models[0].names[i] for i in shown], fontsize=8)
     axis.set_ylim(len(shown) - 0.4, -1.6)
-    axis.set_xlim(0, 1.28 * gain.max())
+    axis.set_xlim(0, 1.28 * added.max())
     axis.set_xlabel("nats added when chosen")
     axis.set_title("mean place in the order", loc="right", fontsize=8)
     for text, values, at, colour in (("D", places, 0.91, _D), ("A", places_a, 1.0, _A)):
@@ -195,7 +199,7 @@ def _draw_maps(
         # Two decades: a few sensors vary much more than the others.
         limit = max(np.abs(values).max() for values in maps)
         norm = mpl.colors.SymLogNorm(limit / _LINEAR, vmin=-limit, vmax=limit)
-    image = None
+    image: Any = None
     for axis, values, model in zip(axes, maps, models, strict=True):
         axis.axis("on")
         image = axis.imshow(values, cmap="RdBu_r", norm=norm, interpolation="nearest")

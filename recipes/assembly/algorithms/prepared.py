@@ -24,7 +24,7 @@ class PreparedAdam:
     def __init__(self, optimizer: torch.optim.Adam, parameters: Sequence[nn.Parameter]) -> None:
         states = [optimizer.state[parameter] for parameter in parameters]
         self._group = optimizer.param_groups[0]
-        self._parameters = list(parameters)
+        self._parameters: list[torch.Tensor] = list(parameters)
         self._means = [state["exp_avg"] for state in states]
         self._squares = [state["exp_avg_sq"] for state in states]
         # One number of steps for each parameter, in one tensor: one addition counts them all.
@@ -52,7 +52,7 @@ class PreparedAdam:
         with torch.no_grad():
             torch._fused_adam_(
                 self._parameters,
-                [parameter.grad for parameter in parameters],
+                [parameter.grad for parameter in parameters if parameter.grad is not None],
                 self._means,
                 self._squares,
                 [],

@@ -52,7 +52,8 @@ class Foresight(nn.Module):
         observed = tensordict.get("observed")
         seen = zero_missing(tensordict.get("observation"), observed)
         mean, std = self.foresee(hidden, tensordict.get("previous_action"))
-        density = torch.distributions.Normal(mean, std, validate_args=False).log_prob(seen)
+        normal = torch.distributions.Normal(mean, std, validate_args=False)
+        density = normal.log_prob(seen)  # type: ignore[no-untyped-call]
         return zero_missing(density, observed).sum(-1)
 
     def foresee(self, hidden: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
