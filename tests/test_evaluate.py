@@ -41,6 +41,7 @@ from assembly.trained import TrainedAgent, load_trained_agent
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from torchrl_drbpn import BeliefDivergedError, BeliefFilter
 from torchrl_drbpn.functional import draw_mechanism
 
 SMOKE = (
@@ -328,6 +329,19 @@ def test_two_processes_give_the_numbers_of_one(
     two = evaluate(tmp_path / "two.csv", drbpn, points="none:0,'mcar:0.5'", processes=2)
     assert one == two
     assert list(evaluate_tasks([], None, 2)) == []  # type: ignore[arg-type]
+
+
+def test_an_agent_whose_belief_diverges_at_a_point_is_named_with_it(
+    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverge(*_: Any, **__: Any) -> Any:
+        raise BeliefDivergedError("the belief is no longer finite.")
+
+    monkeypatch.setattr(BeliefFilter, "step", diverge)
+    protocol = evaluation_grid.Protocol(2, ["sampled"], 1, 5.0, 0, 1)
+    tasks = [(drbpn, parse_point("mcar:0.8", settings, spike_std=5.0), ["sampled"])]
+    with pytest.raises(UserError, match=r"drbpn can't be evaluated at mcar:0\.8: the belief is no"):
+        list(evaluate_tasks(tasks, protocol, 1))
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from assembly.points import Point, episode_rows, evaluate_points, parse_point
 from assembly.run_folder import write_table
 from assembly.settings import Settings
 from assembly.trained import TrainedAgent, load_trained_agent
+from torchrl_drbpn import BeliefDivergedError
 
 Row = Mapping[str, Any]
 
@@ -232,21 +233,31 @@ def evaluate_point(
 
     Returns:
         One row an episode and kind of action.
+
+    Raises:
+        UserError: where the agent's belief diverges there.
     """
     torch.set_num_threads(protocol.threads)
     trained = agent_of(folder)
     drawn = {"reduction_seed": protocol.reduction_seed if point.selection == "random" else None}
     rows = []
-    for _, mode, result in evaluate_points(
-        trained,
-        [point],
-        episodes=protocol.episodes,
-        modes=modes,
-        seed=protocol.seed,
-        reduction_seed=protocol.reduction_seed,
-    ):
-        found = episode_rows(trained, point, mode, result, run=folder.name)
-        rows += [row | {"seed": protocol.seed} | drawn for row in found]
+    try:
+        for _, mode, result in evaluate_points(
+            trained,
+            [point],
+            episodes=protocol.episodes,
+            modes=modes,
+            seed=protocol.seed,
+            reduction_seed=protocol.reduction_seed,
+        ):
+            found = episode_rows(trained, point, mode, result, run=folder.name)
+            rows += [row | {"seed": protocol.seed} | drawn for row in found]
+    except BeliefDivergedError as error:
+        # Such as an agent that was trained without the likelihood of its model.
+        raise UserError(
+            f"{folder.name} can't be evaluated at {point.name}: {error} Leave the point or the run "
+            "out; what is done is kept."
+        ) from error
     return rows
 
 
