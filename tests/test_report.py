@@ -9,14 +9,10 @@ together, are answered with one line, and an earlier report is left as it was.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import itertools
-import json
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +20,7 @@ import pytest
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
 from recipe_tools import ROOT, make_config  # isort: skip
+from report_tools import ASKED, VERSIONS, make_run, quantity, report, table  # isort: skip
 
 from assembly.errors import UserError
 from assembly.report_commands import training_command
@@ -31,83 +28,11 @@ from assembly.report_evaluations import point_kind, point_order
 from assembly.report_index import index_page, studies_of
 from assembly.report_paper import steps_to_threshold, top_return
 from assembly.report_runs import StudyRun, find_folders, flat, read_study
-from assembly.report_statistics import interquartile_mean, interval
 from assembly.report_tables import format_number
-from assembly.run import EVALUATION_COLUMNS
-from assembly.run_folder import Table, write_config, write_table
+from assembly.run_folder import Table, write_table
 from report import run
 
-ASKED = dict.fromkeys(("run", "out", "index", "title", "rows", "unfinished"))
 COMMITTED = sorted(path.parent for path in (ROOT / "results").glob("*/runs"))
-FRAMES = [100, 200, 300, 400]
-VERSIONS = {"python": "3.11.7", "torch": "2.13.0", "platform": "here", "git_commit": "abc"}
-
-
-def make_run(
-    folder: Path,
-    *overrides: str,
-    seed: int = 0,
-    final: float = 50.0,
-    frames: list[int] = FRAMES,
-    points: bool = True,
-    versions: dict[str, str] = VERSIONS,
-    method: str | None = None,
-    **choices: str,
-) -> Path:
-    """Write what a run leaves behind, with numbers that are easy to sum up."""
-    folder.mkdir(parents=True)
-    usual = ("env=hopper", "env.version=v4", "total_frames=400", f"seed={seed}")
-    config = make_config(*usual, *overrides)
-    write_config(folder, config)
-    (folder / "versions.json").write_text(json.dumps(versions))
-    if method is not None:
-        named = choices | {"method": method, "seed": f"s{seed}"}
-        cell = {"study": "grid", "choices": named, "overrides": []}
-        (folder / "cell.json").write_text(json.dumps(cell))
-    columns = ("frames", "return", "missing_ratio", "log_likelihood", "steps_per_second")
-    last = {"return": final, "missing_ratio": 0.3, "log_likelihood": 1.5, "steps_per_second": 200.0}
-    first = last | {"return": None, "missing_ratio": 0.1, "steps_per_second": 100.0}
-    rows = [{"frames": n, **(first if n == frames[0] else last)} for n in frames]
-    Table(folder / "metrics.csv", columns).append(rows)
-    numbers = {"return_std": 1.0, "length_mean": 9.0, "missing_ratio": 0.25, "log_likelihood": 1.0}
-    evaluations = [
-        {"frames": n, "kind": kind, "mode": mode, "episodes": 3, "return_mean": final} | numbers
-        for n, kind in ((200, "training"), (400, "final"))
-        for mode in ("sampled", "mean")
-        if n <= frames[-1]
-    ]
-    Table(folder / "evaluation.csv", EVALUATION_COLUMNS).append(evaluations)
-    if points:
-        episodes = [
-            {"frames": 400, "mechanism": mechanism, "eta": eta, "mode": "sampled", "episode": i}
-            | {"return": value, "length": length, "missing_ratio": eta, "log_likelihood": None}
-            for mechanism, eta, returns in (("none", 0.0, (90, 110)), ("mcar", 0.5, (80, 90)))
-            for i, (value, length) in enumerate(zip(returns, (10, 30), strict=True))
-        ]
-        Table(folder / "points.csv", ("frames", *(k for k in episodes[0] if k != "frames"))).append(
-            episodes
-        )
-    return folder
-
-
-def report(folders: list[Path] | str, out: Path, **options: Any) -> None:
-    wanted = folders if isinstance(folders, str) else [str(folder) for folder in folders]
-    assert run(ASKED | {"run": wanted, "out": str(out)} | options) == 0
-
-
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def quantity(out: Path, name: str, **where: str) -> dict[str, str]:
-    found = [
-        row
-        for row in table(out / "summary.csv")
-        if row["quantity"] == name and all(row[key] == value for key, value in where.items())
-    ]
-    assert len(found) == 1, (name, where, found)
-    return found[0]
 
 
 @pytest.fixture
@@ -209,57 +134,6 @@ def test_versions_that_differ_are_told_run_by_run(tmp_path: Path) -> None:
     assert "- python: 3.11.7\n" in page
     assert "platform" not in page
     assert str(tmp_path) not in page
-
-
-# Means and intervals --------------------------------------------------------------------------
-
-
-def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side() -> None:
-    values = np.array([[100.0, 1.0, 2.0, 3.0], [-7.0, 5.0, 5.0, 90.0]])
-    assert interquartile_mean(values).tolist() == [2.5, 5.0]
-    assert interquartile_mean(np.array([1.0, 2.0, 6.0])) == 3.0  # of three none is left out
-    eight = np.arange(8.0) ** 2
-    assert interquartile_mean(eight) == eight[2:6].mean()
-
-
-def test_the_interval_of_few_runs_is_that_of_every_resample() -> None:
-    means = sorted(np.mean(runs) for runs in itertools.product([1.0, 2.0, 6.0], repeat=3))
-    ends = interval([[6.0, 1.0, 2.0]])
-    assert ends is not None
-    np.testing.assert_allclose(ends, np.percentile(means, [2.5, 97.5]), rtol=1e-12)
-    assert interval([[1.0]]) is None
-    assert interval([[1.0, 2.0], [1.0]]) is None  # of one run nothing can be told
-
-
-def test_runs_are_resampled_within_their_stratum() -> None:
-    """Pooled, two tasks on other scales would make an interval as wide as their distance."""
-    ends = interval([[0.0, 0.1, 0.2], [10.0, 10.1, 10.2]])
-    assert ends is not None
-    low, high = (float(end) for end in ends)
-    assert 4.95 < low < 5.1 < high < 5.25
-
-
-def test_drawn_resamples_agree_with_the_normal_approximation_and_do_not_vary() -> None:
-    values = np.random.default_rng(3).normal(size=40)
-    state = np.random.get_state()[1].copy()
-    ends = interval([values], lambda resampled: resampled[0].mean(-1))
-    again = interval([values], lambda resampled: resampled[0].mean(-1))
-    assert ends is not None
-    assert again is not None
-    half = 1.96 * values.std() / np.sqrt(40)
-    np.testing.assert_allclose(ends, [values.mean() - half, values.mean() + half], atol=0.03)
-    assert (ends[0], ends[1]) == (again[0], again[1])
-    assert (np.random.get_state()[1] == state).all()
-
-
-def test_a_curve_has_the_interval_of_its_points() -> None:
-    curves = np.array([[1.0, 5.0, 0.0], [2.0, 6.0, 0.0], [4.0, 4.0, 3.0]])
-    ends = interval([curves])
-    assert ends is not None
-    for i in range(3):
-        point = interval([curves[:, i]])
-        assert point is not None
-        np.testing.assert_array_equal(np.array(ends)[:, i], np.array(point))
 
 
 # Beside the paper -----------------------------------------------------------------------------
@@ -375,71 +249,6 @@ def test_sample_efficiency_is_told_of_clean_runs_and_says_what_was_not_reached(
     ]
     page = (tmp_path / "out" / "README.md").read_text()
     assert "| `drbpn` | 0 | **25.50** (25.50) | 2000 | not reached in 400 |" in page
-
-
-# Axes beside task, method and seed ------------------------------------------------------------
-
-
-def test_an_axis_of_its_own_gets_a_table_with_the_best_of_each_line(tmp_path: Path) -> None:
-    """Two methods, three learning rates: a mean for each, side by side, in order of size."""
-    returns = {
-        "drbpn": {"lr1e-3": 30.0, "lr5e-4": 50.0, "lr2.5e-4": 40.0},
-        "none": {"lr1e-3": 60.0, "lr5e-4": 20.0},
-    }
-    for method, by_rate in returns.items():
-        for rate, final in by_rate.items():
-            overrides = (f"belief={method}", f"optim.lr={rate[2:]}")
-            name = tmp_path / "runs" / f"{rate}-{method}"
-            make_run(name, *overrides, final=final, method=method, rate=rate, points=False)
-    out = tmp_path / "out"
-    report(str(tmp_path / "runs" / "*"), out)
-    page = (out / "README.md").read_text()
-    lines = page.split("## By rate\n")[1].split("\n## ")[0].strip().splitlines()
-    assert [line for line in lines if line.startswith("|")] == [
-        "| task | method | seeds | steps | `lr2.5e-4` | `lr5e-4` | `lr1e-3` |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-        "| Hopper-v4 | `drbpn` | 0 | 400 | 40.00 | **50.00** | 30.00 |",
-        "| Hopper-v4 | `none` | 0 | 400 |  | 20.00 | **60.00** |",
-    ]
-    row = quantity(out, "training return", method="none", variant="lr1e-3")
-    assert (row["mean"], row["per_seed"]) == ("60", "0=60")
-    margins = {(r["trained_on"].split(", ")[-1], r["margin"]) for r in table(out / "margins.csv")}
-    assert margins == {("lr1e-3", "-0.5"), ("lr5e-4", "1.5")}  # at the same rate
-
-
-def test_choices_of_an_axis_are_means_over_seeds_and_a_run_under_way_is_not_the_best(
-    tmp_path: Path,
-) -> None:
-    for rate, finals in {"lr5e-4": (10.0, 30.0), "lr1e-3": (40.0, 60.0), "lr2e-3": (90.0,)}.items():
-        for seed, final in enumerate(finals):
-            under_way = {"frames": [100, 200]} if rate == "lr2e-3" else {}
-            name = tmp_path / "runs" / f"{rate}-s{seed}"
-            words = f"optim.lr={rate[2:]}"
-            make_run(name, words, seed=seed, final=final, method="m", rate=rate, **under_way)
-    report(str(tmp_path / "runs" / "*"), tmp_path / "out", unfinished=True)
-    page = (tmp_path / "out" / "README.md").read_text()
-    (line,) = (line for line in page.splitlines() if line.startswith("| Hopper-v4 | `m` | 0, 1 |"))
-    cells = [cell.strip() for cell in line.split("|")[5:-1]]
-    # Of two runs there are four resamples: 2.5 % lies .075 of the way from the first to the second.
-    assert cells == ["20.00 [10.75, 29.25]", "**50.00 [40.75, 59.25]**", "90.00 at 200 steps"]
-
-
-def test_an_axis_that_decides_the_corruption_is_a_table_too(tmp_path: Path) -> None:
-    for ratio in ("0.2", "0.5"):
-        words = ("missingness=mcar", f"missingness.eta={ratio}")
-        make_run(tmp_path / "runs" / ratio, *words, method="m", missing=f"mcar{ratio}")
-    report(str(tmp_path / "runs" / "*"), tmp_path / "out")
-    page = (tmp_path / "out" / "README.md").read_text()
-    assert "## By missing\n" in page
-    assert "| task | method | seeds | steps | `mcar0.2` | `mcar0.5` |" in page
-
-
-def test_a_study_without_a_further_axis_has_neither_the_table_nor_the_column(
-    seeds: list[Path], tmp_path: Path
-) -> None:
-    report(seeds, tmp_path / "out")
-    assert "## By" not in (tmp_path / "out" / "README.md").read_text()
-    assert "variant" not in table(tmp_path / "out" / "summary.csv")[0]
 
 
 # Points ---------------------------------------------------------------------------------------

@@ -44,46 +44,45 @@ _OF_MISSING = (Forecast(FILTERED, False, TRUTH, MISSING), Forecast(PREDICTED, Tr
 
 
 @dataclass(frozen=True)
-class Series:
-    """Episodes of the runs of one kind at one point.
+class Runs:
+    """The runs of one kind at one point.
 
     Attributes:
         task: Gymnasium id.
         point: what did not arrive.
-        belief: which kind.
+        method: which kind.
         trained_on: what did not arrive in training.
         runs: how many.
-        tally: of all their episodes.
     """
 
     task: str
     point: str
-    belief: str
+    method: str
     trained_on: str
     runs: int
+
+
+@dataclass(frozen=True)
+class Series(Runs):
+    """Their episodes.
+
+    Attributes:
+        tally: of all of them.
+    """
+
     tally: Tally
 
 
 @dataclass(frozen=True)
-class Outages:
-    """Forecasts of what arrived, of the runs of one kind at one point.
+class Outages(Runs):
+    """Their forecasts of what arrived.
 
     Attributes:
-        task: Gymnasium id.
-        point: what did not arrive.
-        belief: which kind.
-        trained_on: what did not arrive in training.
-        runs: how many.
         missing_ratio: share of the entries that did not arrive.
         classes: of steps since last seen, the last is ``never``.
         rows: of calibration.csv, one a class that has entries enough.
     """
 
-    task: str
-    point: str
-    belief: str
-    trained_on: str
-    runs: int
     missing_ratio: float
     classes: tuple[str, ...]
     rows: Sequence[Mapping[str, Any]]
@@ -115,7 +114,7 @@ def precision_figure(series: Sequence[Series], *, resamples: int, seed: int) -> 
                 if r["count"] >= _FEWEST
             ]
             if points:
-                label = f"{one.belief}: {estimate}"
+                label = f"{one.method}: {estimate}"
                 _curve(axis, ["0", *one.tally.classes], points, style, width, colour, label)
         axis.set_yscale("log")
 
@@ -138,7 +137,7 @@ def outage_figure(series: Sequence[Series], *, resamples: int, seed: int) -> Fig
             Outages(
                 one.task,
                 one.point,
-                one.belief,
+                one.method,
                 one.trained_on,
                 one.runs,
                 one.tally.missing_ratio,
@@ -191,7 +190,7 @@ def draw_outages(outages: Sequence[Outages]) -> Figure | None:
         The figure, a row a task and point, a column a statistic; None where no belief forecasts
         what arrives.
     """
-    kinds = list(dict.fromkeys((one.belief, one.trained_on) for one in outages))
+    kinds = list(dict.fromkeys((one.method, one.trained_on) for one in outages))
     colours = {kind: _COLOURS[i % len(_COLOURS)] for i, kind in enumerate(kinds)}
     shown = [one for one in outages if one.rows]
     if not shown:
@@ -214,7 +213,7 @@ def draw_outages(outages: Sequence[Outages]) -> Figure | None:
             )
             for axis, (name, right, text, scale) in zip(line, _STATISTICS, strict=True):
                 for one in own:
-                    kind = (one.belief, one.trained_on)
+                    kind = (one.method, one.trained_on)
                     ends = (f"{name}_low", f"{name}_high")
                     points_of_one = [
                         (row["steps_since_seen"], row[name], row[ends[0]], row[ends[1]])
@@ -289,7 +288,7 @@ def reliability_figure(series: Sequence[Series]) -> Figure | None:
             total = one.tally.honesty[forecast]["count"].sum()
             if total > 0:
                 shares = one.tally.reliability[forecast].sum(0) / total
-                label = f"{one.belief}: {text}, {forecast.estimate}"
+                label = f"{one.method}: {text}, {forecast.estimate}"
                 axis.plot(LEVELS, shares, style, color=colour, lw=1.8, label=label)
         axis.plot([0, 1], [0, 1], color="#444444", lw=0.8)
         axis.set_xlim(0, 1)
@@ -314,7 +313,7 @@ def _grid(
 ) -> Figure | None:
     """Draw a panel for each task and point with series that have something to draw."""
     # A belief has one colour in every figure of a diagnosis.
-    kinds = list(dict.fromkeys((s.belief, s.trained_on) for s in series))
+    kinds = list(dict.fromkeys((s.method, s.trained_on) for s in series))
     colours = {kind: _COLOURS[i % len(_COLOURS)] for i, kind in enumerate(kinds)}
     shown = [s for s in series if has(s)]
     if not shown:
@@ -334,8 +333,8 @@ def _grid(
                     axis.axis("off")
                     continue
                 for one in own:
-                    kind = (one.belief, one.trained_on)
-                    named = dataclasses.replace(one, belief=_label(kind, kinds))
+                    kind = (one.method, one.trained_on)
+                    named = dataclasses.replace(one, method=_label(kind, kinds))
                     draw(axis, named, colours[kind])
                 missing = [s.tally.missing_ratio for s in own]
                 axis.set_title(_title(task, point, missing, own), fontsize=8.5)

@@ -129,9 +129,7 @@ def render_or_say(
     model: Any,
     task: str,
     poses: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
-    *,
-    width: int,
-    height: int,
+    **size: int,
 ) -> list[NDArray[np.uint8]]:
     """Draw a robot in each pose, or say in one line why that can't be done here.
 
@@ -139,14 +137,13 @@ def render_or_say(
         model: see :func:`render_poses`, as are the others.
         task: name of the task.
         poses: positions and velocities.
-        width: pixels.
-        height: pixels.
+        **size: width and height.
 
     Returns:
         The pictures; none where off-screen rendering fails.
     """
     try:
-        return render_poses(model, task, poses, width=width, height=height)
+        return render_poses(model, task, poses, **size)
     except RuntimeError as error:
         say(f"no pictures of the robot, off-screen rendering failed: {error}")
         return []

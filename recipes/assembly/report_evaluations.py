@@ -10,22 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from assembly.errors import UserError
+from assembly.run_folder import EVALUATION_COLUMNS
 from assembly.settings import Settings, missingness_name
 
 Row = dict[str, Any]
 
 GRID_TABLE, POINTS_TABLE = "robustness.csv", "points.csv"  # of recipes/evaluate.py
 _OWN_TABLE = "evaluation.csv"
-_EVALUATED = (
-    "frames",
-    "mode",
-    "episodes",
-    "return_mean",
-    "return_std",
-    "length_mean",
-    "missing_ratio",
-    "log_likelihood",
-)
+_EVALUATED = tuple(name for name in EVALUATION_COLUMNS if name != "kind")
 
 
 def evaluations(folder: Path, settings: Settings) -> list[Row]:

@@ -18,7 +18,7 @@ from assembly.console import ProgressBar, say
 from assembly.errors import UserError
 from assembly.evaluation import Episodes, evaluate, make_evaluation_environment
 from assembly.interruption import StopRequest
-from assembly.run_folder import Table, write_config, write_versions
+from assembly.run_folder import EVALUATION_COLUMNS, Table, write_config, write_versions
 from assembly.settings import Settings, read_settings
 from assembly.training import (
     Training,
@@ -30,18 +30,6 @@ from assembly.training import (
 )
 from torchrl_drbpn import BeliefDivergedError
 from torchrl_drbpn.functional import native_error
-
-EVALUATION_COLUMNS = (
-    "frames",
-    "kind",
-    "mode",
-    "episodes",
-    "return_mean",
-    "return_std",
-    "length_mean",
-    "missing_ratio",
-    "log_likelihood",
-)
 
 
 def run(config: Mapping[str, Any], folder: Path) -> int:

@@ -33,6 +33,19 @@ _PACKAGES = (
 # Of a run that recipes/study.py started: which cell of which study it is.
 CELL_FILE = "cell.json"
 
+# Of evaluation.csv: one row an evaluation and kind of action.
+EVALUATION_COLUMNS = (
+    "frames",
+    "kind",
+    "mode",
+    "episodes",
+    "return_mean",
+    "return_std",
+    "length_mean",
+    "missing_ratio",
+    "log_likelihood",
+)
+
 # Settings that came after the first run folders, with the value that says what a run without them
 # did: a folder stays readable when a setting is added. "group.key": value
 _LATER_SETTINGS: dict[str, Any] = {
