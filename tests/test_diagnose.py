@@ -519,9 +519,9 @@ def test_runs_of_two_methods_are_two_curves(folders: dict[str, Path], tmp_path: 
     tally = tally_of(load_trained_agent(plain), episodes=1)
     kinds = {("task", "none:0", method, "mcar:0.4", 1.0): [tally] for method in methods}
     pooled = diagnose._pooled(kinds)
-    assert {one.belief: one.runs for one in pooled} == {"drbpn": 1, "drbpn (model_coeff 0)": 1}
+    assert {one.method: one.runs for one in pooled} == {"drbpn": 1, "drbpn (model_coeff 0)": 1}
     louder = kinds | {("task", "none:0", "drbpn", "mcar:0.4", 3.0): [tally]}
-    assert "drbpn, sigma 3" in {one.belief for one in diagnose._pooled(louder)}
+    assert "drbpn, sigma 3" in {one.method for one in diagnose._pooled(louder)}
     assert run([str(folders["drbpn"]), str(plain)], tmp_path / "out") == 0
     with (tmp_path / "out" / "precision.csv").open(newline="") as file:
         assert {(row["run"], row["method"]) for row in csv.DictReader(file)} == {
