@@ -19,6 +19,7 @@ from assembly.belief_figure import save_figure
 from assembly.console import say, start
 from assembly.errors import UserError
 from assembly.evaluation_grid import (
+    DivergedError,
     Grid,
     Protocol,
     Results,
@@ -63,7 +64,12 @@ def run(config: dict[str, Any]) -> int:
         say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
     order = [(folder.name, point.name) for folder, point in wanted]
     processes = config["processes"] or len(os.sched_getaffinity(0))
+    diverged = []
     for done, (folder, point, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
+        if isinstance(rows, DivergedError):
+            diverged.append(f"{folder.name} at {point.name}")
+            say(f"{done}/{len(tasks)} {rows}")
+            continue
         results.add(folder.name, point.name, rows)
         say(f"{done}/{len(tasks)} {folder.name} {point.name}: {_summary(rows)}")
     results.arrange(order)
@@ -74,6 +80,11 @@ def run(config: dict[str, Any]) -> int:
             path = output.with_name(f"{output.stem}-{task}.png")
             save_figure(figure, path, dpi=120)
             say(f"written: {path}")
+    if diverged:
+        raise UserError(
+            f"{len(diverged)} of {len(wanted)} points have no return, as the agent's belief "
+            f"diverged there ({', '.join(diverged)}); the others are in {output}."
+        )
     return 0
 
 

@@ -29,7 +29,7 @@ import evaluate as recipe
 from assembly import evaluation_grid
 from assembly.errors import UserError
 from assembly.evaluation import Episodes
-from assembly.evaluation_grid import Grid, evaluate_tasks, grid_points
+from assembly.evaluation_grid import DivergedError, Grid, evaluate_tasks, grid_points
 from assembly.points import Point, evaluate_points, parse_point, removed_sensors
 from assembly.robustness_figure import draw_robustness, mean_interval, read_rows
 from assembly.run import run as train
@@ -340,8 +340,28 @@ def test_an_agent_whose_belief_diverges_at_a_point_is_named_with_it(
     monkeypatch.setattr(BeliefFilter, "step", diverge)
     protocol = evaluation_grid.Protocol(2, ["sampled"], 1, 5.0, 0, 1)
     tasks = [(drbpn, parse_point("mcar:0.8", settings, spike_std=5.0), ["sampled"])]
-    with pytest.raises(UserError, match=r"drbpn can't be evaluated at mcar:0\.8: the belief is no"):
-        list(evaluate_tasks(tasks, protocol, 1))
+    ((_, _, outcome),) = evaluate_tasks(tasks, protocol, 1)
+    assert isinstance(outcome, DivergedError)
+    assert str(outcome) == "drbpn has no return at mcar:0.8: the belief is no longer finite."
+
+
+@pytest.mark.parametrize("points", ["'mcar:0.8',none:0", "'mcar:0.8'"])
+def test_a_point_where_a_belief_diverges_keeps_no_other_from_being_evaluated(
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: str
+) -> None:
+    def diverging(trained: TrainedAgent, points: list[Point], **how: Any) -> Any:
+        if points[0].name == "mcar:0.8":
+            raise BeliefDivergedError("the belief is no longer finite.")
+        return evaluate_points(trained, points, **how)
+
+    monkeypatch.setattr(evaluation_grid, "evaluate_points", diverging)
+    out = tmp_path / "out.csv"
+    expected = rf"1 of {points.count(':')} points have no return, .*\(drbpn at mcar:0\.8\)"
+    with pytest.raises(UserError, match=expected):
+        evaluate(out, drbpn, points=points, figures=True)
+    monkeypatch.undo()
+    rows = evaluate(out, drbpn, points=points)
+    assert {row["point"] for row in rows} == set(points.replace("'", "").split(","))
 
 
 @pytest.mark.parametrize(

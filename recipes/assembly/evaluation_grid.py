@@ -37,6 +37,10 @@ _COLUMNS = {
 _AGAIN = "name another `output`, or overwrite=true begins anew."
 
 
+class DivergedError(UserError):
+    """Name an agent and the point where its belief left the range of its numbers."""
+
+
 @dataclass(frozen=True)
 class Grid:
     """Levels of the default grid; see conf/evaluate.yaml."""
@@ -235,7 +239,7 @@ def evaluate_point(
         One row an episode and kind of action.
 
     Raises:
-        UserError: where the agent's belief diverges there.
+        DivergedError: where the agent's belief diverges there.
     """
     torch.set_num_threads(protocol.threads)
     trained = agent_of(folder)
@@ -254,11 +258,17 @@ def evaluate_point(
             rows += [row | {"seed": protocol.seed} | drawn for row in found]
     except BeliefDivergedError as error:
         # Such as an agent that was trained without the likelihood of its model.
-        raise UserError(
-            f"{folder.name} can't be evaluated at {point.name}: {error} Leave the point or the run "
-            "out; what is done is kept."
-        ) from error
+        raise DivergedError(f"{folder.name} has no return at {point.name}: {error}") from error
     return rows
+
+
+def _evaluated(
+    folder: Path, point: Point, modes: Sequence[str], protocol: Protocol
+) -> list[dict[str, Any]] | DivergedError:
+    try:
+        return evaluate_point(folder, point, modes, protocol)
+    except DivergedError as error:
+        return error
 
 
 @lru_cache(maxsize=1)
@@ -276,7 +286,7 @@ def agent_of(folder: Path) -> TrainedAgent:
 
 def evaluate_tasks(
     tasks: Sequence[tuple[Path, Point, Sequence[str]]], protocol: Protocol, processes: int
-) -> Iterator[tuple[Path, Point, list[dict[str, Any]]]]:
+) -> Iterator[tuple[Path, Point, list[dict[str, Any]] | DivergedError]]:
     """Evaluate points of runs, several at a time; the numbers do not depend on how many.
 
     Args:
@@ -285,18 +295,19 @@ def evaluate_tasks(
         processes: at a time; 1: in this process.
 
     Yields:
-        Folder, point and rows, as they come.
+        Folder, point and rows, as they come; in place of the rows the error of an agent that
+        diverged there, which keeps no other point from being evaluated.
     """
     processes = min(processes, len(tasks))
     if processes <= 1:
         agent_of.cache_clear()  # the folder may have got another checkpoint since
         for folder, point, modes in tasks:
-            yield folder, point, evaluate_point(folder, point, modes, protocol)
+            yield folder, point, _evaluated(folder, point, modes, protocol)
         return
     # A fresh interpreter each: a fork would inherit torch's threads and half-held locks.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
-        futures = {pool.submit(evaluate_point, *task, protocol): task for task in tasks}
+        futures = {pool.submit(_evaluated, *task, protocol): task for task in tasks}
         try:
             for future in as_completed(futures):
                 folder, point, _ = futures[future]
