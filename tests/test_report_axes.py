@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from report_tools import make_run, quantity, report, table
+# Puts recipes/ on the path, so it comes first.
+from report_tools import make_run, quantity, report, table  # isort: skip
+
+from assembly.report_cells import margin
+from assembly.report_variants import mark_best
 
 
 def test_an_axis_of_its_own_gets_a_table_with_the_best_of_each_line(tmp_path: Path) -> None:
@@ -67,3 +72,19 @@ def test_a_study_without_a_further_axis_has_neither_the_table_nor_the_column(
     report([make_run(tmp_path / "run")], tmp_path / "out")
     assert "## By" not in (tmp_path / "out" / "README.md").read_text()
     assert "variant" not in table(tmp_path / "out" / "summary.csv")[0]
+
+
+def test_the_best_of_a_line_are_finished_cells_ties_among_them() -> None:
+    def cell(iqm: float | None, finished: bool = True) -> dict[str, Any]:
+        return {"iqm": iqm, "finished": finished}
+
+    assert mark_best([cell(2.0), cell(1.0), cell(2.0)]) == [True, False, True]
+    assert mark_best([cell(2.0), cell(1.0), cell(2.0, False)]) == [True, False, False]
+    assert mark_best([cell(1.0), cell(None), cell(3.0, False)]) == [False] * 3  # one to compare
+
+
+def test_a_margin_over_next_to_nothing_is_not_told_to_the_per_cent() -> None:
+    near_nothing = {"margin": 778.64, "low": 2.0, "high": 900.0}
+    assert margin(near_nothing) == "over 10 x"
+    assert margin({"margin": 9.5, "low": None, "high": None}) == "+950 %"
+    assert margin({"margin": 0.2, "low": 0.05, "high": 0.41}) == "+20 % [+5 %, +41 %]"

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+_LARGEST_MARGIN = 10  # that is told as a share; the CSV files hold every number
+
 
 def number(value: float | None) -> str:
     """Return a number with about three digits; nothing for None.
@@ -56,8 +58,11 @@ def margin(row: Mapping[str, Any]) -> str:
         row: with ``margin, low, high``, shares.
 
     Returns:
-        Such as ``+20 % [+5 %, +41 %]``.
+        Such as ``+20 % [+5 %, +41 %]``; ``over 10 x`` from eleven times on: the other's return is
+        then so near 0 that its share is noise.
     """
+    if row["margin"] > _LARGEST_MARGIN:
+        return f"over {_LARGEST_MARGIN} x"
     if row["low"] is None:
         return percent(row["margin"])
     return f"{percent(row['margin'])} [{percent(row['low'])}, {percent(row['high'])}]"
