@@ -1,0 +1,29 @@
+"""A small particle filter of fixed parameters, and frames for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from contracts import ACTION, OBS, BeliefModuleContract
+from tensordict import TensorDict
+
+from torchrl_drbpn import ParticleFilter
+
+K, HIDDEN, LATENT = 4, 6, 3
+OPTIONAL = (("belief", "observation"), ("belief", "latent"), ("belief", "effective_sample_size"))
+
+
+def make_filter(
+    obs: int = OBS, action: int = ACTION, dtype: torch.dtype | None = None, **kwargs: Any
+) -> ParticleFilter:
+    """A small filter of fixed parameters."""
+    sizes = {"num_particles": K, "hidden_dim": HIDDEN, "latent_dim": LATENT}
+    sizes |= {"encoder_sizes": (7, 5), "action_width": 3}
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return ParticleFilter(obs, action, dtype=dtype, **(sizes | kwargs))
+
+
+def make_frames(shape: tuple[int, ...], seed: int = 0) -> TensorDict:
+    return BeliefModuleContract().make_frames(shape, torch.float64, seed)
