@@ -316,6 +316,25 @@ def test_float32_is_kept_and_gradients_flow() -> None:
     assert gradient.isfinite().all()
 
 
+@pytest.mark.parametrize(("obs", "state", "spread"), [(17, 4, 3.0), (27, 8, 1.0), (105, 16, 1.0)])
+def test_a_float32_belief_at_the_noise_floor_has_the_scores_of_float64(
+    obs: int, state: int, spread: float
+) -> None:
+    """H of low rank, R std .01: in float32 the innovation covariance has no Cholesky factor."""
+    matrix, predicted = randn(obs, state), spread * randn(20, state, seed=1)
+    cov, noise = spread**2 * torch.eye(state), 1e-4 * torch.eye(obs)
+    truth = predicted + spread * randn(20, state, seed=2)
+    x = truth @ matrix.T + 0.01 * randn(20, obs, seed=3)
+    seen = randn(20, obs, seed=4) > -0.5
+    doubles = [v.float().double() for v in (predicted, cov, x, matrix, noise)]
+    scores = []
+    for m, P, reading, H, R in ([v.float() for v in doubles], doubles):
+        error, S = innovation(Belief(m, P.expand(20, -1, -1)), reading, seen, H, R)
+        scores.append((normalised_squared(error, S, seen), log_score(error, S, seen)))
+    torch.testing.assert_close(scores[0], scores[1], rtol=1e-9, atol=1e-9)
+    assert 0.8 < float(scores[1][0].sum() / seen.sum()) < 1.2
+
+
 # Bad input ---------------------------------------------------------------------------------------
 
 

@@ -259,6 +259,19 @@ def test_an_interval_over_episodes_is_that_of_a_mean_over_independent_episodes()
     assert (low, high) == pytest.approx((mean - half, mean + half), abs=0.15 * half)
 
 
+def test_an_interval_over_few_episodes_holds_the_mean_as_often_as_it_says() -> None:
+    """Plain percentiles hold it in .91 of the cases; .007 is a standard error of 1000 trials."""
+    generator = torch.Generator().manual_seed(0)
+    ones, held = torch.ones(10, dtype=torch.float64), 0
+    for seed in range(1000):
+        values = torch.randn(10, generator=generator, dtype=torch.float64)
+        _, low, high = Resampling(10, 1000, seed).ratio(values, ones)
+        assert low is not None
+        assert high is not None
+        held += low < 0 < high
+    assert 0.93 <= held / 1000 <= 0.97
+
+
 def test_nothing_to_count_is_an_empty_cell_and_one_episode_has_no_interval() -> None:
     resampling = Resampling(3, 50, seed=0)
     assert resampling.ratio(torch.zeros(3), torch.zeros(3)) == (None, None, None)

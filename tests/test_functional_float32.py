@@ -30,12 +30,13 @@ def test_float32_is_near_float64(state, obs, form):
 
 
 def at_the_noise_floor(
-    state: int, obs: int, *, full_noise: bool = False
+    state: int, obs: int, *, full_noise: bool = False, rank: int | None = None, spread: float = 0.3
 ) -> tuple[Problem, Problem]:
     """Return one problem in float32 and the same numbers in float64: R std 1e-2, Q std .3.
 
-    H is random, masks of every density from empty to complete, and the data come from the model
-    itself, so that innovations have the size the model claims.
+    H is random, of full rank where none is given; `spread` is the Q std. Masks are of every
+    density from empty to complete, and the data come from the model itself, so that innovations
+    have the size the model claims.
     """
     batch, time, std = 4, 60, 1e-2
     options = {"batch": batch, "time": time, "hidden": (32,), "residual": False}
@@ -48,14 +49,17 @@ def at_the_noise_floor(
     density = torch.linspace(0, 1, time).view(1, time, 1)
     double.observed = torch.rand(batch, time, obs, generator=g) < density
     with torch.no_grad():
-        leaves["transition_root"].copy_(0.3 * torch.eye(state))
+        leaves["transition_root"].copy_(spread * torch.eye(state))
         leaves["initial_root"].copy_(torch.eye(state))
         leaves["noise"].copy_(std * torch.eye(obs) if full_noise else torch.full((obs,), std**2))
-        leaves["matrix"].copy_(randn(obs, state))
+        matrix = randn(obs, state)
+        if rank is not None:
+            matrix = randn(obs, rank) @ randn(rank, state) / rank**0.5
+        leaves["matrix"].copy_(matrix)
         model, truth = double.model(), leaves["start_mean"]
         for t in range(time):
             action = leaves["previous_action"][:, t]
-            moved = model.transition(truth, action) + 0.3 * randn(batch, state)
+            moved = model.transition(truth, action) + spread * randn(batch, state)
             fresh = leaves["initial_mean"] + randn(batch, state)
             truth = torch.where(double.reset[:, t, None], fresh, moved)
             noise = std * randn(batch, obs)
@@ -70,13 +74,30 @@ def at_the_noise_floor(
 @pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
 @pytest.mark.parametrize(("state", "obs"), [(8, 27), (17, 17), (32, 11), (16, 105)], ids=str)
 def test_float32_keeps_its_digits_at_the_noise_floor(state, obs, full_noise):
-    # In the form that is chosen, for a full R with more sensors than states in float64 inside.
     single, double = at_the_noise_floor(state, obs, full_noise=full_noise)
     outputs, truth = single.fast("auto"), double.fast("auto")
     mean, cov, ll = (a.detach().double() - b.detach() for a, b in zip(outputs, truth, strict=True))
     assert float(mean.abs().max()) < 1e-3
     assert float(cov.abs().max()) < 1e-5
     assert float(ll.abs().max()) < 1e-2
+    found, expected = (
+        single.gradients((outputs[0], outputs[2])),
+        double.gradients((truth[0], truth[2])),
+    )
+    for name, gradient in found.items():
+        error = (gradient.double() - expected[name]).norm() / expected[name].norm()
+        assert float(error) < 1e-3, name
+
+
+@pytest.mark.parametrize("form", ["auto", "innovation", "loop"])
+@pytest.mark.parametrize("spread", [0.3, 3.0])
+@pytest.mark.parametrize(("state", "obs", "rank"), [(17, 17, 4), (32, 32, 8)], ids=str)
+def test_float32_keeps_its_digits_where_sensors_are_redundant(state, obs, rank, spread, form):
+    """H of low rank: S = H Q H' + R is as ill-conditioned as Q / R, 1e5 to 1e7 here."""
+    single, double = at_the_noise_floor(state, obs, rank=rank, spread=spread)
+    outputs, truth = single.fast(form), double.fast(form)
+    for a, e, scale in zip(outputs, truth, (1, max(1, spread**2), obs), strict=True):
+        assert float((a.detach().double() - e.detach()).abs().max()) < 2e-5 * scale
     found, expected = (
         single.gradients((outputs[0], outputs[2])),
         double.gradients((truth[0], truth[2])),

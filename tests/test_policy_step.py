@@ -125,6 +125,58 @@ def test_a_step_equals_the_tensordict_policy(kind, policy_input):
     assert torch.equal(our_age, age)
 
 
+@pytest.mark.parametrize(
+    ("obs", "state", "cov"),
+    [(27, 8, "full"), (105, 16, "full"), (105, 16, "diag"), (17, 17, "diag")],
+)
+def test_a_float32_step_has_the_digits_of_the_float32_module(obs, state, cov):
+    """R std .01 and an H of low rank: a factorisation in float32 would lose most of them."""
+    g = torch.Generator().manual_seed(0)
+    emission = LinearGaussianEmission(obs, state, ACTION, cov=cov, init_std=0.011)
+    rank = min(obs, state) // 2
+    with torch.no_grad():
+        emission.matrix.copy_(
+            torch.randn(obs, rank, generator=g) @ torch.randn(rank, state, generator=g)
+        )
+    transition = GaussianTransition(state, ACTION, init_std=1.0)
+    belief = BeliefFilter(obs, ACTION, state, transition=transition, emission=emission)
+    step = PolicyStep(BeliefFilterModule(belief), nn.Identity())
+    rows = 64
+    reading = torch.randn(rows, state, generator=g) @ emission.matrix.detach().mT
+    reading += 0.01 * torch.randn(rows, obs, generator=g)
+    seen = torch.rand(rows, obs, generator=g) < 0.7
+    action, mean = torch.zeros(rows, ACTION), torch.randn(rows, state, generator=g)
+    first = torch.zeros(rows, 1, dtype=torch.bool)
+    with torch.no_grad():
+        _, found, _ = step(reading, seen, action, first, mean, torch.ones(rows, 1).long())
+        expected = belief.step(mean, None, action, reading, seen, first.squeeze(-1)).mean
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("kind", ["innovation", "information", "network"])
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
+    belief, head = make(kind)
+    step = PolicyStep(belief, head)
+    g = torch.Generator().manual_seed(3)
+    obs, state = belief.filter.obs_dim, belief.filter.state_dim
+    reading = torch.randn(*batch, obs, generator=g).double()
+    seen = torch.rand(*batch, obs, generator=g) < 0.7
+    action, mean = (
+        torch.zeros(*batch, ACTION).double(),
+        torch.randn(*batch, state, generator=g).double(),
+    )
+    first, age = torch.zeros(*batch, 1, dtype=torch.bool), torch.ones(*batch, 1).long()
+    chosen, filtered, _ = step(reading, seen, action, first, mean, age)
+    assert chosen.shape == (*batch, ACTION)
+    flat = [x.reshape(-1, x.shape[-1]) for x in (reading, seen, action, first, mean, age)]
+    torch.testing.assert_close(filtered.reshape(-1, state), step(*flat)[1])
+    step.float()
+    assert step.initial_state(2)[0].dtype == torch.float32
+    cast = step(reading.float(), seen, action.float(), first, mean.float(), age)[1]
+    torch.testing.assert_close(cast.double(), filtered, rtol=1e-4, atol=1e-4)
+
+
 @pytest.mark.parametrize("kind", ["innovation", "information"])
 def test_what_stands_under_a_false_mask_is_not_read(kind):
     belief, head = make(kind)

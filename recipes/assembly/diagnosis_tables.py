@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from statistics import NormalDist
 from typing import Any
 
 import torch
@@ -21,10 +22,13 @@ def _same(ratio: Tensor) -> Tensor:
 
 
 class Resampling:
-    """Draw episodes with replacement, to say how far a number would be off with others.
+    r"""Draw episodes with replacement, to say how far a number would be off with others.
 
     Entries of one episode hang together, those of two do not: whole episodes are drawn (the
-    bootstrap over clusters), and a number is a ratio of sums over the drawn ones.
+    bootstrap over clusters), and a number is a ratio of sums over the drawn ones. Of few episodes
+    the 95 % percentiles are too narrow (91 % of ten); the interval takes those that a Student
+    interval of a mean would reach: :math:`\Phi(\mp t_{n-1} \sqrt{n / (n - 1)})`, the expanded percentile
+    interval of Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015.
 
     Args:
         episodes: how many there are.
@@ -61,9 +65,23 @@ class Resampling:
         if (denominator > 0).sum() < 2:
             return value, None, None
         ratios = then((self.weights @ numerator) / (self.weights @ denominator))
-        ends = torch.tensor(_INTERVAL, dtype=torch.float64)
-        low, high = torch.nanquantile(ratios, ends).tolist()
+        low, high = torch.nanquantile(ratios, _levels(int((denominator > 0).sum()))).tolist()
         return value, low, high
+
+
+def _levels(count: int) -> Tensor:
+    """Return the percentiles whose interval holds a mean of `count` episodes in 95 of 100 cases."""
+    normal, free = NormalDist(), count - 1
+    z = normal.inv_cdf(_INTERVAL[1])
+    # Student's quantile by its expansion in 1 / free, 26.7.5 of Abramowitz and Stegun.
+    student = (
+        z
+        + (z**3 + z) / (4 * free)
+        + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * free**2)
+        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * free**3)
+    )
+    tail = normal.cdf(-student * math.sqrt(count / free))
+    return torch.tensor([tail, 1 - tail], dtype=torch.float64)
 
 
 def precision_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[dict[str, Any]]:

@@ -60,7 +60,8 @@ def normalised_squared(error: Tensor, cov: Tensor, observed: Tensor | None = Non
         observed: bool M, shape ``(*batch, dim)``, True = counts; None: all of them.
 
     Returns:
-        Shape ``(*batch,)``, no unit; exactly 0 where nothing was observed.
+        Shape ``(*batch,)``, no unit, float64; exactly 0 where nothing was observed. It is computed
+        in float64: an innovation covariance is as ill-conditioned as signal over noise.
 
     Raises:
         ValueError: if the mask is not bool or not of the shape of ``error``.
@@ -74,8 +75,8 @@ def normalised_squared(error: Tensor, cov: Tensor, observed: Tensor | None = Non
     if observed is not None:
         check_observed(error, observed)
         error, cov = zero_missing(error, observed), masked_cov(cov, observed)
-    factor = torch.linalg.cholesky(cov)
-    white = torch.linalg.solve_triangular(factor, error.unsqueeze(-1), upper=False)
+    factor = torch.linalg.cholesky(cov.double())
+    white = torch.linalg.solve_triangular(factor, error.double().unsqueeze(-1), upper=False)
     return white.square().sum((-2, -1))
 
 
@@ -359,7 +360,7 @@ def log_score(error: Tensor, cov: Tensor, observed: Tensor, dim: int | None = No
         dim: dimension of ``batch`` that is averaged over; None: all of them.
 
     Returns:
-        Nats per observed entry; smaller is better. NaN where nothing was observed.
+        Nats per observed entry, float64; smaller is better. NaN where nothing was observed.
 
     Raises:
         ValueError: if the mask is not bool or not of the shape of ``error``.
@@ -368,11 +369,11 @@ def log_score(error: Tensor, cov: Tensor, observed: Tensor, dim: int | None = No
         >>> import torch
         >>> seen = torch.tensor([[True, False], [True, True]])
         >>> score = log_score(torch.zeros(2, 2), torch.eye(2), seen)
-        >>> torch.allclose(score, torch.tensor(2 * torch.pi).log() / 2)
+        >>> torch.allclose(score, torch.tensor(2 * torch.pi).double().log() / 2)
         True
     """
     check_observed(error, observed)
-    density, count = masked_log_density(error, cov, observed), observed.sum(-1)
+    density, count = masked_log_density(error.double(), cov.double(), observed), observed.sum(-1)
     if dim is None:
         return -density.sum() / count.sum()
     return -density.sum(dim) / count.sum(dim)

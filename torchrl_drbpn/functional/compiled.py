@@ -128,7 +128,7 @@ def native_error(dtype: torch.dtype = torch.float32, source: str = "native") -> 
 def spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor] | None:
     """Invert many small symmetric positive definite matrices, without a gradient.
 
-    Sixteen (float64: eight) at a time, where LAPACK takes one after the other.
+    Eight at a time and in float64, where LAPACK takes one after the other.
 
     Args:
         matrix: shape ``(*batch, n, n)``; lower triangles are read.
@@ -153,7 +153,7 @@ def spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor] | None:
         return None
     matrix = matrix.contiguous()
     inverse, log_det = torch.empty_like(matrix), matrix.new_empty(matrix.shape[:-2])
-    scratch = matrix.new_empty(3 * n * n * 64 // matrix.element_size())
+    scratch = torch.empty(3 * n * n * 8, dtype=torch.float64)
     load_library(dtype).spd_inverse(
         ctypes.c_long(n),
         ctypes.c_long(log_det.numel()),

@@ -145,7 +145,7 @@ def filter_step(
         ll = _information_likelihood(wide, step, residual, weight, observed, log_det, row)
         step, ll = step.to(m.dtype), ll.to(m.dtype)
     else:
-        wide = _for_innovation(model)
+        wide = model.double()
         wide_H, Q, R = wide.emission_matrix, constant_cov(wide), wide.full_emission_cov()
         residual = residual.to(R.dtype)
         cross, initial_cross = Q @ wide_H.mT, wide.initial_cov @ wide_H.mT
@@ -338,9 +338,7 @@ def _native(
 ) -> tuple[Tensor, Tensor]:
     f, dtype, (*batch, time) = model.transition, start.dtype, reset.shape
     assert isinstance(f, MeanNetwork)  # choose_form saw to it; for the type checker
-    # As in _for_innovation and _information; here the whole filter is float64 then.
-    obs, state = model.emission_matrix.shape
-    wide = torch.float64 if obs > state else dtype
+    state = model.emission_matrix.shape[-1]
     information = choose_form(model) == "information"
     covs = constant_cov(model), model.initial_cov
     if information:
@@ -350,10 +348,7 @@ def _native(
     def rows(x: Tensor | None) -> Tensor | None:
         return None if x is None else x.reshape(-1, *x.shape[len(batch) :]).contiguous()
 
-    start, observation, action = (
-        x.to(wide) for x in (start.reshape(-1, state), observation, action)
-    )
-    stored = None if stored is None else stored.to(wide)
+    start = start.reshape(-1, state)
     parameters = (
         *covs, model.emission_cov, model.emission_matrix, model.action_matrix,
         model.emission_offset, model.initial_mean,
@@ -363,13 +358,13 @@ def _native(
         information, f.residual, f.activation,
         *map(rows, (observation, observed, action, reset, restart, stored)),
         start if start.stride(-1) == 1 else start.contiguous(),
-        *(x.to(wide).contiguous() for x in parameters),
+        *(x.contiguous() for x in parameters),
     )  # fmt: skip
     ll = ll.view(*batch, time)
     if information:
         ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
         ll = torch.where(observed.any(-1), ll, 0.0)
-    return mean.view(*batch, time, state).to(dtype), ll.to(dtype)
+    return mean.view(*batch, time, state), ll.to(dtype)
 
 
 def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, list[Tensor]]:
@@ -380,16 +375,6 @@ def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, li
     drive = torch.nn.functional.linear(action, f.weights[0][:, state:], f.biases[0])
     rest = [p for pair in zip(f.weights[1:], f.biases[1:], strict=True) for p in pair]
     return f, drive, [f.weights[0][:, :state], *rest]
-
-
-def _for_innovation(model: StateSpace) -> StateSpace:
-    """Return the model in the dtype in which its innovation covariance is factorised.
-
-    With more sensors than states (a full R) H Q H' is of low rank and the innovation covariance
-    as ill-conditioned as Q / R: float32 loses most digits there, float64 does not.
-    """
-    obs, state = model.emission_matrix.shape
-    return model.double() if obs > state else model
 
 
 def _innovation(
@@ -403,7 +388,7 @@ def _innovation(
     stored: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     f, drive, weights = _network(model, action)
-    wide = _for_innovation(model)
+    wide = model.double()  # see InnovationRecurrence
     H, Q, R = wide.emission_matrix, constant_cov(wide), wide.full_emission_cov()
     cross, initial_cross = Q @ H.mT, wide.initial_cov @ H.mT
     y = zero_missing(observation - model.offset(action), observed)

@@ -48,7 +48,8 @@ def predict(
 
     Keyword Args:
         jacobian: J, the derivative of f by the mean, shape ``(*batch, state, state)``; None (the
-            paper) drops the past covariance.
+            paper) drops the past covariance. A Q that was trained without it holds the past's share
+            already: propagating it afterwards would count that twice.
 
     Returns:
         The predicted belief.
@@ -88,8 +89,9 @@ def innovation(
         offset: o = B a + d, shape ``(*batch, obs)``; None is 0.
 
     Returns:
-        ``Belief(v, S)``: v ``(*batch, obs)``, 0 at missing entries; S ``(*batch, obs, obs)`` over
-        all components, observed or not.
+        ``Belief(v, S)``, float64 whatever the dtype of the belief: with R at its floor beside a
+        large P, S has a condition number of 1e6 and more. v ``(*batch, obs)``, 0 at missing
+        entries; S ``(*batch, obs, obs)`` over all components, observed or not.
 
     Example:
         >>> import torch
@@ -100,13 +102,13 @@ def innovation(
         ([1.0, 0.0], [2.0, 2.0])
     """
     check_observed(observation, observed)
-    H = emission_matrix
-    expected = belief.mean @ H.mT
+    H = emission_matrix.double()
+    expected = belief.mean.double() @ H.mT
     if offset is not None:
         expected = expected + offset
     # Zero first, subtract after: a NaN under a False mask must reach neither value nor gradient.
     residual = zero_missing(zero_missing(observation, observed) - expected, observed)
-    return Belief(residual, H @ belief.cov @ H.mT + emission_cov)
+    return Belief(residual, H @ belief.cov.double() @ H.mT + emission_cov)
 
 
 def update(
@@ -147,18 +149,19 @@ def update(
         >>> mean.tolist(), torch.allclose(cov, expected)
         ([0.25, 0.0], True)
     """
-    # In float64 whatever the dtype: with R at its floor beside a large P, S has a condition number
-    # of 1e6 and more, and the two terms of the covariance cancel along measured directions.
+    # In float64 whatever the dtype, as the innovation is: the two terms of the covariance cancel
+    # along measured directions.
+    dtype = belief.mean.dtype
     H, P, R = (x.double() for x in (emission_matrix, belief.cov, emission_cov))
-    v = innovation(belief, observation, observed, emission_matrix, emission_cov, offset).mean
-    factor = torch.linalg.cholesky(masked_cov(H @ P @ H.mT + R, observed))
+    v, S = innovation(belief, observation, observed, H, R, offset)
+    factor = torch.linalg.cholesky(masked_cov(S, observed))
     # K' = A^-1 (M'M) H P: the rows of missing entries are zero, so K ignores them.
     cross = zero_missing(H @ P, observed.unsqueeze(-1))
     K = torch.cholesky_solve(cross, factor).mT
-    mean = belief.mean + (K @ v.double().unsqueeze(-1)).squeeze(-1).to(v.dtype)
+    mean = belief.mean + (K @ v.unsqueeze(-1)).squeeze(-1).to(dtype)
     kept = torch.eye(mean.shape[-1], dtype=P.dtype, device=P.device) - K @ H
     cov = kept @ P @ kept.mT + K @ R @ K.mT
-    cov = (0.5 * (cov + cov.mT)).to(v.dtype)
+    cov = (0.5 * (cov + cov.mT)).to(dtype)
     # Rounding errs by at most eps/2 sqrt(C_ii C_jj) in every entry. Directions measured thousands
     # of times without a predict between hold less variance than that beside directions never
     # measured; raising the diagonal by state * eps/2 of itself outweighs it whatever the signs.
@@ -202,10 +205,5 @@ def log_likelihood(
         >>> torch.allclose(value, expected)
         True
     """
-    wide = Belief(belief.mean.double(), belief.cov.double())
-    H, R = emission_matrix.double(), emission_cov.double()
-    x, o = observation.double(), None if offset is None else offset.double()
-    # In float64 as in update: S is too ill-conditioned for float32 when R is at its floor.
-    return masked_log_density(*innovation(wide, x, observed, H, R, o), observed).to(
-        belief.mean.dtype
-    )
+    v, S = innovation(belief, observation, observed, emission_matrix, emission_cov, offset)
+    return masked_log_density(v, S, observed).to(belief.mean.dtype)

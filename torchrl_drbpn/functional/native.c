@@ -1,6 +1,6 @@
 /* The belief filter over [batch, time] and its reverse pass as two functions, for a constant Q, eq.
  * (8), (10), (12) [DRBPN]. The same sums as recurrence.py, where PyTorch needs some hundred small
- * operations a minibatch. compiled.py compiles this file, once for each `real`; the files that it
+ * operations a minibatch. compiled.py compiles this file, once for each `given`; the files that it
  * includes hold functions that are used here alone:
  *
  *   native_linalg.h       vectors, matrix products, many small inverses at once
@@ -12,6 +12,10 @@
  * covariances receive. What is here serves both: the transition, the innovation
  * e = y - H m - B a - d of the predicted mean, their gradients, and at the end those of weights,
  * biases, H, B and d.
+ *
+ * What the caller gives and gets is of type `given`, float or double; all arithmetic is in double. S
+ * is as ill-conditioned as signal over noise, and where H is of low rank float loses most digits of
+ * inv(S). Likelihoods, their gradients and the information form's inv(P) are double for every caller.
  */
 #include <math.h>
 #include <stdint.h>
@@ -20,8 +24,9 @@
 #ifndef REAL
 #define REAL float
 #endif
-typedef REAL real;
-#define LOG_2PI ((real)1.8378770664093453)
+typedef REAL given;
+typedef double real;
+#define LOG_2PI 1.8378770664093453
 
 #include "native_linalg.h"
 #include "native_memory.h"
@@ -39,19 +44,17 @@ void sizes(const int64_t *dims, int64_t *out) {
 /* ---------------------------------------------------------------- forward */
 
 /* One step of the transition: the predicted mean into a.mean and, beside the action, predicted. */
-static void predict(const Sizes *s, const Ahead *a, const Tape *tape, long t, const real *start,
-                    const real *stored, const uint8_t *restart, const real *action,
-                    const uint8_t *reset, const real *initial) {
+static void predict(const Sizes *s, const Ahead *a, const Tape *tape, long t, const given *start,
+                    const given *stored, const uint8_t *restart, const given *action,
+                    const uint8_t *reset, const given *initial) {
     long m = s->state, width = s->width[0], S = s->S, J = s->J;
     long batch = s->batch, time = s->time, row = t * batch;
     real *input = tape->input + row * J, *predicted = tape->predicted + row * J;
     for (long b = 0; b < batch; b++) {
-        const real *from = a->mean + b * S;
-        if (t == 0) from = start + b * s->start_stride;
-        if (restart && restart[b * time + t]) from = stored + (b * time + t) * m;
-        memcpy(input + b * J, from, m * sizeof(real));
-        const real *moved = action + (b * time + t) * s->action;
-        memcpy(input + b * J + m, moved, s->action * sizeof(real));
+        if (restart && restart[b * time + t]) widen(m, stored + (b * time + t) * m, input + b * J);
+        else if (t == 0) widen(m, start + b * s->start_stride, input + b * J);
+        else memcpy(input + b * J, a->mean + b * S, m * sizeof(real));
+        widen(s->action, action + (b * time + t) * s->action, input + b * J + m);
         memset(input + b * J + width, 0, (J - width) * sizeof(real));
         memcpy(predicted + b * J, input + b * J, J * sizeof(real));
     }
@@ -79,11 +82,11 @@ static void predict(const Sizes *s, const Ahead *a, const Tape *tape, long t, co
 
 void forward(const int64_t *dims, void **p) {
     Sizes z = read_sizes(dims), *s = &z;
-    const real *x = p[0], *action = p[2], *stored = p[5], *start = p[6];
-    real *const cov[2] = {p[7], p[8]};
-    const real *noise = p[9], *H = p[10], *B = p[11], *d = p[12], *initial = p[13];
+    const given *x = p[0], *action = p[2], *stored = p[5], *start = p[6];
+    const given *noise = p[9], *H = p[10], *B = p[11], *d = p[12], *initial = p[13];
     const uint8_t *observed = p[1], *reset = p[3], *restart = p[4];
-    real *mean = p[14], *ll = p[15];
+    given *mean = p[14];
+    real *ll = p[15];
     Memory kept = {p[16], 0}, scratch = {p[17], 0};
     Tape tape = lay_tape(s, &kept);
     Ahead a = lay_ahead(s, &scratch);
@@ -91,15 +94,15 @@ void forward(const int64_t *dims, void **p) {
     long batch = s->batch, time = s->time;
 
     for (long i = 1; i <= s->layers; i++) {
-        const real *weight = p[16 + 2 * i], *bias = p[17 + 2 * i];
-        pack(s->width[i - 1], s->width[i], weight, 1, s->width[i - 1], a.weight_t[i], s->W[i]);
-        pack(1, s->width[i], bias, 0, 1, a.bias[i], s->W[i]);
+        const given *weight = p[16 + 2 * i], *bias = p[17 + 2 * i];
+        take_in(s->width[i - 1], s->width[i], weight, 1, s->width[i - 1], a.weight_t[i], s->W[i]);
+        take_in(1, s->width[i], bias, 0, 1, a.bias[i], s->W[i]);
     }
-    pack(m, n, H, 1, m, a.sensor_t, N);
-    pack(s->action, n, B, 1, s->action, a.sensor_t + m * N, N);
-    pack(1, n, d, 0, 1, a.offset, N);
-    if (s->information) prepare_information(s, &a, &tape, cov, noise, H, observed, reset);
-    else prepare_innovation(s, &a, &tape, cov, noise, H, observed, reset);
+    take_in(m, n, H, 1, m, a.sensor_t, N);
+    take_in(s->action, n, B, 1, s->action, a.sensor_t + m * N, N);
+    take_in(1, n, d, 0, 1, a.offset, N);
+    if (s->information) prepare_information(s, &a, &tape, p + 7, noise, H, observed, reset);
+    else prepare_innovation(s, &a, &tape, p + 7, noise, observed, reset);
 
     for (long t = 0; t < time; t++) {
         predict(s, &a, &tape, t, start, stored, restart, action, reset, initial);
@@ -139,39 +142,38 @@ static void by_transition(const Sizes *s, const Back *w, const Tape *tape, long 
 
 void backward(const int64_t *dims, void **p) {
     Sizes z = read_sizes(dims), *s = &z;
-    const real *g_mean = p[0], *g_ll = p[1], *H = p[6], *B = p[7];
-    real *const cov[2] = {p[4], p[5]};
+    const given *g_mean = p[0], *H = p[6], *B = p[7];
+    const real *g_ll = p[1];
     const uint8_t *reset = p[2], *restart = p[3];
     Memory kept = {p[8], 0}, scratch = {p[9], 0};
-    real *g_x = p[10], *g_action = p[11], *g_stored = p[12], *g_start = p[13];
-    real *g_cov[2] = {p[14], p[15]}, *g_noise = p[16], *g_H = p[17], *g_B = p[18], *g_d = p[19];
-    real *g_initial = p[20];
+    given *g_x = p[10], *g_action = p[11], *g_stored = p[12], *g_start = p[13], *g_B = p[18];
     const uint8_t *observed = p[21];
-    const real *noise = p[22];
+    const given *noise = p[22];
     Tape tape = lay_tape(s, &kept);
     Back w = lay_back(s, &scratch);
     long n = s->obs, m = s->state, width = s->width[0], N = s->N, S = s->S, J = s->J;
     long batch = s->batch, time = s->time, last = s->layers;
 
     for (long i = 1; i <= last; i++)
-        pack(s->width[i], s->width[i - 1], p[22 + i], s->width[i - 1], 1, w.weight[i], s->W[i - 1]);
-    pack(n, m, H, m, 1, w.sensor, J);
+        take_in(s->width[i], s->width[i - 1], p[22 + i], s->width[i - 1], 1, w.weight[i],
+                s->W[i - 1]);
+    take_in(n, m, H, m, 1, w.sensor, J);
     for (long i = 0; i < n; i++) {
-        memcpy(w.sensor + i * J + m, B + i * s->action, s->action * sizeof(real));
+        widen(s->action, B + i * s->action, w.sensor + i * J + m);
         memset(w.sensor + i * J + width, 0, (J - width) * sizeof(real));
     }
-    if (s->information) begin_information(s, &w, cov, noise, H, g_noise);
+    if (s->information) begin_information(s, &w, p + 4, noise, H);
     else begin_innovation(s, &w);
     memset(w.carry, 0, batch * S * sizeof(real));
     memset(w.half, 0, s->groups * BYTES);
     memset(w.sum, 0, s->entries * BYTES);
-    memset(g_initial, 0, m * sizeof(real));
+    memset(w.g_initial, 0, m * sizeof(real));
 
     for (long t = time - 1; t >= 0; t--) {
         long row = t * batch;
         real *g = w.filtered + row * S, *ge = w.error + row * N, *top = w.layer[last] + row * S;
         for (long b = 0; b < batch; b++) {
-            const real *outer = g_mean ? g_mean + (b * time + t) * m : 0;
+            const given *outer = g_mean ? g_mean + (b * time + t) * m : 0;
             for (long i = 0; i < S; i++)
                 g[b * S + i] = w.carry[b * S + i] + (outer && i < m ? outer[i] : 0);
         }
@@ -181,14 +183,14 @@ void backward(const int64_t *dims, void **p) {
         memset(w.by_predicted, 0, batch * J * sizeof(real));
         for (long b = 0; b < batch; b++) {
             long at = b * time + t, again = reset[at] != 0;
-            real by = g_ll ? g_ll[at] : 0, half = (real)0.5 * by;
+            real by = g_ll ? g_ll[at] : 0, half = 0.5 * by;
             real *e = ge + b * N, *left = w.left + (row + b) * N, *zb = tape.z + (row + b) * N;
             for (long i = n; i < N; i++) e[i] = 0;
             for (long i = 0; i < n; i++) e[i] -= by * zb[i];
             /* by S: (left z' + z left')/2 - half inv(S), of ordinary steps summed after the loop */
             for (long i = 0; i < N; i++) left[i] = -(e[i] + half * zb[i]);
             if (s->information)
-                by_information(s, &w, &tape, row + b, observed + at * n, half, again, g_noise);
+                by_information(s, &w, &tape, row + b, observed + at * n, half, again);
             else by_innovation(s, &w, &tape, row + b, half, again);
             memcpy(w.by_predicted + b * J, g + b * S, m * sizeof(real));
             if (again) memset(g + b * S, 0, S * sizeof(real));
@@ -200,7 +202,7 @@ void backward(const int64_t *dims, void **p) {
             real *by = w.by_predicted + b * J;
             int again = reset[b * time + t] != 0;
             for (long i = 0; i < S; i++) top[b * S + i] = i < m && !again ? by[i] : 0;
-            if (again) for (long i = 0; i < m; i++) g_initial[i] += by[i];
+            if (again) for (long i = 0; i < m; i++) w.g_initial[i] += by[i];
         }
         by_transition(s, &w, &tape, t);
         for (long b = 0; b < batch; b++) {
@@ -213,28 +215,30 @@ void backward(const int64_t *dims, void **p) {
             if (g_action)
                 for (long i = 0; i < s->action; i++)
                     g_action[at * s->action + i] = by[m + i] + w.by_predicted[b * J + m + i];
-            if (g_x) memcpy(g_x + at * n, ge + b * N, n * sizeof(real));
+            if (g_x) narrow(n, ge + b * N, g_x + at * n);
         }
     }
-    if (g_start) unpack(batch, m, w.carry, S, g_start);
+    if (g_start) give_out(batch, m, w.carry, S, g_start);
 
     for (long i = 1; i <= last; i++) {
         const real *in = i == 1 ? tape.input : tape.hidden[i - 1];
-        real *by_weight = p[22 + last + 2 * i - 1], *by_bias = p[22 + last + 2 * i];
         long wide = s->W[i - 1];
         product(s->width[i], wide, s->rows, w.layer[i], 1, s->W[i], in, wide, w.wide, wide, 1, 0);
-        unpack(s->width[i], s->width[i - 1], w.wide, wide, by_weight);
-        memset(by_bias, 0, s->width[i] * sizeof(real));
+        give_out(s->width[i], s->width[i - 1], w.wide, wide, p[22 + last + 2 * i - 1]);
+        memset(w.wide, 0, s->W[i] * sizeof(real));
         for (long r = 0; r < s->rows; r++)
-            for (long k = 0; k < s->width[i]; k++) by_bias[k] += w.layer[i][r * s->W[i] + k];
+            for (long k = 0; k < s->width[i]; k++) w.wide[k] += w.layer[i][r * s->W[i] + k];
+        narrow(s->width[i], w.wide, p[22 + last + 2 * i]);
     }
     product(n, J, s->rows, w.error, 1, N, tape.predicted, J, w.wide, J, -1, 0);
-    unpack(n, m, w.wide, J, g_H);
-    for (long i = 0; i < n; i++)
-        memcpy(g_B + i * s->action, w.wide + i * J + m, s->action * sizeof(real));
-    memset(g_d, 0, n * sizeof(real));
+    for (long i = 0; i < n; i++) {
+        memcpy(w.g_H + i * m, w.wide + i * J, m * sizeof(real));
+        narrow(s->action, w.wide + i * J + m, g_B + i * s->action);
+    }
+    memset(w.wide, 0, N * sizeof(real));
     for (long r = 0; r < s->rows; r++)
-        for (long i = 0; i < n; i++) g_d[i] -= w.error[r * N + i];
+        for (long i = 0; i < n; i++) w.wide[i] -= w.error[r * N + i];
+    narrow(n, w.wide, p[19]);
 
     vec *sum = (vec *)w.sum;
     for (long g = 0; g < s->groups; g++) {
@@ -242,6 +246,9 @@ void backward(const int64_t *dims, void **p) {
         const vec *I = (const vec *)tape.inverse + g * s->entries;
         for (long i = 0; i < s->entries; i++) sum[i] += half * I[i];
     }
-    if (s->information) finish_information(s, &w, &tape, H, g_ll, observed, g_cov, g_noise, g_H);
-    else finish_innovation(s, &w, &tape, H, cov, g_cov, g_noise, g_H);
+    if (s->information) finish_information(s, &w, &tape, H, g_ll, observed, p + 14);
+    else finish_innovation(s, &w, &tape, H, p + 4, p + 14);
+    narrow(s->full_noise ? n * n : n, w.g_noise, p[16]);
+    narrow(n * m, w.g_H, p[17]);
+    narrow(m, w.g_initial, p[20]);
 }

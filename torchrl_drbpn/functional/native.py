@@ -78,8 +78,11 @@ class NativeRecurrence(torch.autograd.Function):
     Inputs: whether it is the information form, residual, activation, observation, observed,
     previous action, reset, restart, stored mean, start, Q, initial covariance, R, H, B, d, initial
     mean, then the weight and the bias of each layer. All contiguous, one dtype, on the CPU. The
-    information form takes the inverses of Q and of the initial covariance in their places, leaves
-    their log-determinant out of the likelihood, and takes nothing observed for no special case.
+    information form takes the inverses of Q and of the initial covariance in their places, in
+    float64, leaves their log-determinant out of the likelihood, and takes nothing observed for no
+    special case.
+
+    It computes in float64 whatever it is given, and the likelihood comes out in float64.
     """
 
     @staticmethod
@@ -97,8 +100,11 @@ class NativeRecurrence(torch.autograd.Function):
         library = load_library(x.dtype)
         counts = (ctypes.c_int64 * 3)()
         library.sizes(dims, counts)
-        tape, scratch = x.new_empty(counts[0]), x.new_empty(counts[1])
-        mean, ll = x.new_empty(batch, time, state), x.new_empty(batch, time)
+        tape, scratch, ll = (
+            torch.empty(shape, dtype=torch.float64)
+            for shape in (counts[0], counts[1], (batch, time))
+        )
+        mean = x.new_empty(batch, time, state)
         _call(
             library.forward,
             dims,
@@ -119,15 +125,15 @@ class NativeRecurrence(torch.autograd.Function):
         observed, reset, restart, Q, initial_cov, R, H, B, d, tape, *layers = ctx.saved_tensors
         batch, time, obs, state = ctx.shape
         wanted = ctx.needs_input_grad
-        g_x = tape.new_empty(batch, time, obs) if wanted[3] else None
-        g_action = tape.new_empty(batch, time, B.shape[-1]) if wanted[5] else None
-        g_stored = tape.new_empty(batch, time, state) if wanted[8] else None
-        g_start = tape.new_empty(batch, state) if wanted[9] else None
+        g_x = H.new_empty(batch, time, obs) if wanted[3] else None
+        g_action = H.new_empty(batch, time, B.shape[-1]) if wanted[5] else None
+        g_stored = H.new_empty(batch, time, state) if wanted[8] else None
+        g_start = H.new_empty(batch, state) if wanted[9] else None
         of_model = [torch.empty_like(v) for v in (Q, initial_cov, R, H, B, d)]
-        g_initial = tape.new_empty(state)
+        g_initial = H.new_empty(state)
         of_layers = [torch.empty_like(v) for v in layers]
         _call(
-            load_library(tape.dtype).backward,
+            load_library(H.dtype).backward,
             ctx.dims,
             [
                 None if g_mean is None else g_mean.contiguous(),

@@ -34,14 +34,14 @@ static void gather(const Sizes *s, const Ahead *a, long group, const uint8_t *ob
 
 /* Ahead of the loop: the products h_i h_i' and the inverses of all rows. */
 static void prepare_information(const Sizes *s, const Ahead *a, const Tape *tape,
-                                real *const prior[2], const real *noise, const real *H,
+                                void *const *prior, const given *noise, const given *H,
                                 const uint8_t *observed, const uint8_t *reset) {
     long n = s->obs, m = s->state, N = s->N, S = s->S;
     real *to = a->products;
     for (int k = 0; k < 2; k++) pack(m, m, prior[k], m, 1, a->prior[k], S);
-    pack(n, m, H, m, 1, a->sensor, S);
+    take_in(n, m, H, m, 1, a->sensor, S);
     for (long i = 0; i < n; i++)
-        a->inverse_noise[i] = 1 / noise[i], a->log_noise[i] = log(noise[i]) + LOG_2PI;
+        a->inverse_noise[i] = 1 / (real)noise[i], a->log_noise[i] = log(noise[i]) + LOG_2PI;
     for (long i = 0; i < m; i++)
         for (long j = 0; j <= i; j++)
             for (long k = 0; k < n; k++) *to++ = a->sensor_t[i * N + k] * a->sensor_t[j * N + k];
@@ -54,7 +54,7 @@ static void prepare_information(const Sizes *s, const Ahead *a, const Tape *tape
  * zeros where nothing was observed. Without log|P|. e' z as a sum of squares: shift is where it is
  * least, so an error of shift counts by its square alone. */
 static void gain_information(const Sizes *s, const Ahead *a, const Tape *tape, long t,
-                             const uint8_t *observed, const uint8_t *reset, real *mean, real *ll) {
+                             const uint8_t *observed, const uint8_t *reset, given *mean, real *ll) {
     long n = s->obs, m = s->state, N = s->N, S = s->S, batch = s->batch, row = t * batch;
     real *z = tape->z + row * N, *shift = tape->shift + row * S;
     for (long b = 0; b < batch; b++)
@@ -75,20 +75,21 @@ static void gain_information(const Sizes *s, const Ahead *a, const Tape *tape, l
             sum += z[b * N + i] * left + (seen ? a->log_noise[i] : 0);
         }
         for (long i = 0; i < m; i++) sum += moved[i] * a->pull[b * S + i];
-        ll[at] = (real)-0.5 * sum;
-        for (long i = 0; i < m; i++) mean[at * m + i] = a->mean[b * S + i] += moved[i];
+        ll[at] = -0.5 * sum;
+        for (long i = 0; i < m; i++) a->mean[b * S + i] += moved[i];
+        narrow(m, a->mean + b * S, mean + at * m);
     }
 }
 
 /* Ahead of the reverse loop: what every step reads; nothing is summed yet. */
-static void begin_information(const Sizes *s, const Back *w, real *const prior[2],
-                              const real *noise, const real *H, real *g_noise) {
+static void begin_information(const Sizes *s, const Back *w, void *const *prior,
+                              const given *noise, const given *H) {
     long n = s->obs, m = s->state;
-    pack(m, n, H, 1, m, w->sensor_t, s->N);
-    for (long i = 0; i < n; i++) w->inverse_noise[i] = 1 / noise[i];
+    take_in(m, n, H, 1, m, w->sensor_t, s->N);
+    for (long i = 0; i < n; i++) w->inverse_noise[i] = 1 / (real)noise[i];
     for (int k = 0; k < 2; k++) pack(m, m, prior[k], m, 1, w->prior[k], s->S);
     memset(w->by_prior[1], 0, m * s->S * sizeof(real));
-    memset(g_noise, 0, n * sizeof(real));
+    memset(w->g_noise, 0, n * sizeof(real));
 }
 
 /* By the innovation through the gain, one step: W H C g. */
@@ -105,12 +106,12 @@ static void by_gain_information(const Sizes *s, const Back *w, const Tape *tape,
 
 /* By R and by inv(P), one row: what does not wait for the sums over all rows. */
 static void by_information(const Sizes *s, Back *w, const Tape *tape, long r,
-                           const uint8_t *observed, real half, int again, real *g_noise) {
+                           const uint8_t *observed, real half, int again) {
     long m = s->state, S = s->S;
     const real *z = tape->z + r * s->N, *left = w->left + r * s->N, *shift = tape->shift + r * S;
     real *p = w->gained + r * S, *outer = w->outer + r * S;
     for (long i = 0; i < s->obs; i++)
-        g_noise[i] += z[i] * left[i] - (observed[i] ? half * w->inverse_noise[i] : 0);
+        w->g_noise[i] += z[i] * left[i] - (observed[i] ? half * w->inverse_noise[i] : 0);
     for (long i = m; i < S; i++) p[i] = 0;
     for (long i = 0; i < S; i++) outer[i] = -(p[i] + half * shift[i]);
     if (!again) {
@@ -179,9 +180,9 @@ static const real *spread(const Sizes *s, const Back *w, const Tape *tape, const
 }
 
 /* By H, R and the two inv(P), once every row is there; g_H and g_noise hold their first parts. */
-static void finish_information(const Sizes *s, Back *w, const Tape *tape, const real *H,
-                               const real *g_ll, const uint8_t *observed, real **g_prior,
-                               real *g_noise, real *g_H) {
+static void finish_information(const Sizes *s, Back *w, const Tape *tape, const given *H,
+                               const real *g_ll, const uint8_t *observed, void *const *g_prior) {
+    real *g_noise = w->g_noise, *g_H = w->g_H;
     long n = s->obs, m = s->state, N = s->N, S = s->S;
     product(n, S, s->rows, tape->z, 1, N, w->gained, S, w->wide, S, 1, 0);
     product(n, S, s->rows, w->error, 1, N, tape->shift, S, w->wide, S, -1, 1);
@@ -189,7 +190,8 @@ static void finish_information(const Sizes *s, Back *w, const Tape *tape, const 
         for (long j = 0; j < m; j++) g_H[i * m + j] += w->wide[i * S + j];
     const real *by = g_ll ? spread(s, w, tape, g_ll, observed) : 0;
     for (long i = 0; i < n && by; i++, by += s->half) {
-        const real *h = H + i * m, *at = by;
+        const given *h = H + i * m;
+        const real *at = by;
         real square = 0;
         for (long j = 0; j < m; j++)
             for (long k = 0; k <= j; k++, at++) {
@@ -197,7 +199,7 @@ static void finish_information(const Sizes *s, Back *w, const Tape *tape, const 
                 if (k < j) g_H[i * m + k] -= *at * h[j];
                 square += (k < j ? 2 : 1) * *at * h[j] * h[k];
             }
-        g_noise[i] += (real)0.5 * square * w->inverse_noise[i];
+        g_noise[i] += 0.5 * square * w->inverse_noise[i];
     }
     product(m, S, s->rows, w->outer, 1, S, tape->shift, S, w->by_prior[0], S, 1, 0);
     const vec *sum = (const vec *)w->sum;
@@ -207,9 +209,10 @@ static void finish_information(const Sizes *s, Back *w, const Tape *tape, const 
             w->by_prior[0][i * S + j] -= total;
             if (i > j) w->by_prior[0][j * S + i] -= total;
         }
-    for (int k = 0; k < 2; k++)
+    for (int k = 0; k < 2; k++) {
+        real *to = g_prior[k];
         for (long i = 0; i < m; i++)
             for (long j = 0; j < m; j++)
-                g_prior[k][i * m + j] =
-                    (real)0.5 * (w->by_prior[k][i * S + j] + w->by_prior[k][j * S + i]);
+                to[i * m + j] = 0.5 * (w->by_prior[k][i * S + j] + w->by_prior[k][j * S + i]);
+    }
 }

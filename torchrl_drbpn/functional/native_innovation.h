@@ -32,19 +32,19 @@ static void invert(const Sizes *s, const Ahead *a, long group, const uint8_t *ob
 }
 
 /* Ahead of the loop: P H', H P H' + R and the inverses of all rows. */
-static void prepare_innovation(const Sizes *s, const Ahead *a, const Tape *tape,
-                               real *const cov[2], const real *noise, const real *H,
-                               const uint8_t *observed, const uint8_t *reset) {
+static void prepare_innovation(const Sizes *s, const Ahead *a, const Tape *tape, void *const *cov,
+                               const given *noise, const uint8_t *observed, const uint8_t *reset) {
     long n = s->obs, m = s->state, N = s->N, S = s->S;
     for (int k = 0; k < 2; k++) {
-        product(m, N, m, cov[k], m, 1, a->sensor_t, N, tape->cross[k], N, 1, 0);
+        take_in(m, m, cov[k], m, 1, a->prior[k], S);
+        product(m, N, m, a->prior[k], S, 1, a->sensor_t, N, tape->cross[k], N, 1, 0);
         pack(n, m, tape->cross[k], 1, N, tape->cross_t[k], S);
-        if (s->full_noise) pack(n, n, noise, n, 1, a->cov[k], N);
+        if (s->full_noise) take_in(n, n, noise, n, 1, a->cov[k], N);
         else {
             memset(a->cov[k], 0, n * N * sizeof(real));
             for (long i = 0; i < n; i++) a->cov[k][i * N + i] = noise[i];
         }
-        product(n, N, m, H, m, 1, tape->cross[k], N, a->cov[k], N, 1, 1);
+        product(n, N, m, a->sensor_t, 1, N, tape->cross[k], N, a->cov[k], N, 1, 1);
     }
     for (long g = 0; g < s->groups; g++)
         invert(s, a, g, observed, reset, tape->inverse + g * n * n * LANES, a->log_det + g * LANES);
@@ -53,7 +53,7 @@ static void prepare_innovation(const Sizes *s, const Ahead *a, const Tape *tape,
 /* One step from the predicted mean and the innovation e of each row, both in `a`: z = inv(S) e, the
  * mean moves by P H' z, of the P that the row started from. */
 static void gain_innovation(const Sizes *s, const Ahead *a, const Tape *tape, long t,
-                            const uint8_t *observed, const uint8_t *reset, real *mean, real *ll) {
+                            const uint8_t *observed, const uint8_t *reset, given *mean, real *ll) {
     long n = s->obs, m = s->state, N = s->N, S = s->S, batch = s->batch, row = t * batch;
     real *z = tape->z + row * N;
     solve(0, n, N, row, row + batch, tape->inverse, a->error, a->error_lanes, tape->z);
@@ -67,8 +67,8 @@ static void gain_innovation(const Sizes *s, const Ahead *a, const Tape *tape, lo
             quadratic += z[b * N + i] * a->error[b * N + i];
             count += observed[at * n + i];
         }
-        ll[at] = count ? (real)-0.5 * (quadratic + a->log_det[row + b] + count * LOG_2PI) : 0;
-        memcpy(mean + at * m, a->mean + b * S, m * sizeof(real));
+        ll[at] = count ? -0.5 * (quadratic + a->log_det[row + b] + count * LOG_2PI) : 0;
+        narrow(m, a->mean + b * S, mean + at * m);
     }
 }
 
@@ -108,8 +108,9 @@ static void by_innovation(const Sizes *s, const Back *w, const Tape *tape, long 
 }
 
 /* By R, H and P, once every row is there: S = H C + R with C = P H'; g_H holds its first part. */
-static void finish_innovation(const Sizes *s, const Back *w, const Tape *tape, const real *H,
-                              real *const cov[2], real *const g_cov[2], real *g_noise, real *g_H) {
+static void finish_innovation(const Sizes *s, const Back *w, const Tape *tape, const given *H,
+                              void *const *cov, void *const *g_cov) {
+    real *g_noise = w->g_noise, *g_H = w->g_H;
     long n = s->obs, m = s->state, N = s->N, S = s->S;
     product(m, N, s->rows, w->filtered, 1, S, tape->z, N, w->cross[0], N, 1, 0);
     product(n, N, s->rows, w->left, 1, N, tape->z, N, w->cov[0], N, 1, 0);
@@ -118,20 +119,20 @@ static void finish_innovation(const Sizes *s, const Back *w, const Tape *tape, c
         for (long j = 0; j < n; j++) w->cov[0][i * N + j] -= over_lanes(sum[i * n + j]);
 
     memset(g_noise, 0, (s->full_noise ? n * n : n) * sizeof(real));
-    pack(n, m, H, m, 1, w->sensor, S); /* J is at least S */
+    take_in(n, m, H, m, 1, w->sensor, S); /* J is at least S */
     for (int k = 0; k < 2; k++) {
         for (long i = 0; i < n; i++)
             for (long j = 0; j < N; j++)
                 w->square[i * N + j] =
-                    j < n ? (real)0.5 * (w->cov[k][i * N + j] + w->cov[k][j * N + i]) : 0;
+                    j < n ? 0.5 * (w->cov[k][i * N + j] + w->cov[k][j * N + i]) : 0;
         for (long i = 0; i < n; i++) {
             if (!s->full_noise) g_noise[i] += w->square[i * N + i];
             else for (long j = 0; j < n; j++) g_noise[i * n + j] += w->square[i * N + j];
         }
-        product(m, N, n, H, 1, m, w->square, N, w->cross[k], N, 1, 1);
+        product(m, N, n, w->sensor, 1, S, w->square, N, w->cross[k], N, 1, 1);
         product(m, S, n, w->cross[k], N, 1, w->sensor, S, w->wide, S, 1, 0);
-        unpack(m, m, w->wide, S, g_cov[k]);
-        pack(m, m, cov[k], m, 1, w->noise_prior[k], S);
+        give_out(m, m, w->wide, S, g_cov[k]);
+        take_in(m, m, cov[k], m, 1, w->noise_prior[k], S);
         product(n, S, n, w->square, N, 1, tape->cross_t[k], S, w->wide, S, 1, 0);
         product(n, S, m, w->cross[k], 1, N, w->noise_prior[k], S, w->wide, S, 1, 1);
         for (long i = 0; i < n; i++)

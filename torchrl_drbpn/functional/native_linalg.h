@@ -83,15 +83,27 @@ static void add_outer(long rows, long cols, const real *left, const real *right,
 }
 
 /* to[r][c] = from[r * row + c * col], columns from `cols` to `ld` zero. */
-static void pack(long rows, long cols, const real *from, long row, long col, real *to, long ld) {
-    for (long r = 0; r < rows; r++) {
-        for (long c = 0; c < cols; c++) to[r * ld + c] = from[r * row + c * col];
-        for (long c = cols; c < ld; c++) to[r * ld + c] = 0;
+#define PACK(name, type)                                                                        \
+    static void name(long rows, long cols, const type *from, long row, long col, real *to,      \
+                     long ld) {                                                                 \
+        for (long r = 0; r < rows; r++) {                                                       \
+            for (long c = 0; c < cols; c++) to[r * ld + c] = from[r * row + c * col];           \
+            for (long c = cols; c < ld; c++) to[r * ld + c] = 0;                                \
+        }                                                                                       \
     }
+PACK(pack, real)
+PACK(take_in, given)
+
+static void widen(long n, const given *from, real *to) {
+    for (long i = 0; i < n; i++) to[i] = from[i];
 }
 
-static void unpack(long rows, long cols, const real *from, long ld, real *to) {
-    for (long r = 0; r < rows; r++) memcpy(to + r * cols, from + r * ld, cols * sizeof(real));
+static void narrow(long n, const real *from, given *to) {
+    for (long i = 0; i < n; i++) to[i] = (given)from[i];
+}
+
+static void give_out(long rows, long cols, const real *from, long ld, given *to) {
+    for (long r = 0; r < rows; r++) narrow(cols, from + r * ld, to + r * cols);
 }
 
 /* ---------------------------------------------------------------- LANES inverses at once */
@@ -142,9 +154,8 @@ static void invert_lanes(long n, vec *A, vec *X, vec *I, vec *det) {
     for (long j = 0; j < n; j++) { /* BLOCK sums at once: one alone would wait for itself */
         vec c = A[j * n + j];
         for (long k = 0; k < j; k++) c -= A[j * n + k] * A[j * n + k];
-        for (long l = 0; l < LANES; l++) c[l] = sizeof(real) == 4 ? sqrtf(c[l]) : sqrt(c[l]);
-        for (long l = 0; l < LANES; l++)
-            sum[l] += 2 * (sizeof(real) == 4 ? logf(c[l]) : log(c[l]));
+        for (long l = 0; l < LANES; l++) c[l] = sqrt(c[l]);
+        for (long l = 0; l < LANES; l++) sum[l] += 2 * log(c[l]);
         A[j * n + j] = c, X[j * n + j] = 1 / c;
         long i = j + 1;
         for (; i + BLOCK <= n; i += BLOCK) column(BLOCK, n, i, j, A, X);
@@ -165,21 +176,21 @@ static void invert_lanes(long n, vec *A, vec *X, vec *I, vec *det) {
 }
 
 /* The same for `count` whole matrices in rows, for the forms in PyTorch. */
-void spd_inverse(long n, long count, const real *matrix, real *inverse, real *log_det,
+void spd_inverse(long n, long count, const given *matrix, given *inverse, given *log_det,
                  real *scratch) {
     real *A = scratch, *X = A + n * n * LANES, *I = X + n * n * LANES;
     for (long first = 0; first < count; first += LANES) {
         vec det;
         for (long l = 0; l < LANES; l++) {
-            const real *from = matrix + (first + l < count ? first + l : count - 1) * n * n;
+            const given *from = matrix + (first + l < count ? first + l : count - 1) * n * n;
             for (long i = 0; i < n; i++)
                 for (long j = 0; j <= i; j++) A[(i * n + j) * LANES + l] = from[i * n + j];
         }
         invert_lanes(n, (vec *)A, (vec *)X, (vec *)I, &det);
         for (long l = 0; l < LANES && first + l < count; l++) {
-            real *to = inverse + (first + l) * n * n;
-            for (long i = 0; i < n * n; i++) to[i] = I[i * LANES + l];
-            log_det[first + l] = det[l];
+            given *to = inverse + (first + l) * n * n;
+            for (long i = 0; i < n * n; i++) to[i] = (given)I[i * LANES + l];
+            log_det[first + l] = (given)det[l];
         }
     }
 }

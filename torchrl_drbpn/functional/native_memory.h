@@ -72,8 +72,8 @@ static Ahead lay_ahead(const Sizes *s, Memory *m) {
         a.products = take(m, s->half * s->obs), a.weight = take(m, s->obs * 2 * LANES);
         a.gathered = take(m, s->half * 2 * LANES), a.square = take(m, n * n * LANES);
         a.pull = take(m, s->batch * s->S), a.fit = take(m, s->batch * s->N);
-        a.prior[0] = take(m, n * s->S), a.prior[1] = take(m, n * s->S);
     } else a.cov[0] = take(m, s->obs * s->N), a.cov[1] = take(m, s->obs * s->N);
+    a.prior[0] = take(m, s->state * s->S), a.prior[1] = take(m, s->state * s->S);
     a.factor = take(m, n * n * LANES), a.lower = take(m, n * n * LANES);
     a.error = take(m, s->batch * s->N), a.error_lanes = take(m, n * LANES);
     a.log_det = take(m, s->groups * LANES);
@@ -92,7 +92,7 @@ typedef struct { /* scratch of backward */
     real *weight[MAX_LAYERS + 1], *layer[MAX_LAYERS + 1], *sensor, *noise_prior[2], *filtered,
         *error, *left, *half, *lanes, *sum, *carry, *by_predicted, *by_input, *cross[2], *cov[2],
         *square, *wide, *sensor_t, *inverse_noise, *gained, *prior[2],
-        *by_prior[2], *outer, *pull, *step, *spread;
+        *by_prior[2], *outer, *pull, *step, *spread, *g_noise, *g_H, *g_initial;
 } Back;
 
 static Back lay_back(const Sizes *s, Memory *m) {
@@ -126,5 +126,7 @@ static Back lay_back(const Sizes *s, Memory *m) {
         b.square = take(m, s->obs * s->N);
     }
     b.wide = take(m, widest * widest);
+    b.g_noise = take(m, s->full_noise ? s->obs * s->obs : s->obs);
+    b.g_H = take(m, s->obs * s->state), b.g_initial = take(m, s->state);
     return b;
 }

@@ -270,7 +270,12 @@ def _spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class InnovationRecurrence(torch.autograd.Function):
-    """mean_t = m_t + G_t A_t^-1 (y_t - H m_t) and its log-likelihood, obs x obs factorised."""
+    """mean_t = m_t + G_t A_t^-1 (y_t - H m_t) and its log-likelihood, obs x obs factorised.
+
+    The covariances come in float64: A_t is as ill-conditioned as signal over noise, and where H is
+    of low rank float32 would lose most digits of its inverse. The gain is well scaled and goes back
+    to the loop's dtype.
+    """
 
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -283,7 +288,6 @@ class InnovationRecurrence(torch.autograd.Function):
 
         # Masking by products and lerp with weights of exactly 0 or 1: the same numbers as
         # torch.where, which costs several times as much on these, the largest tensors here.
-        # The covariances may come in float64 (see _innovation); the loop runs in its own dtype.
         mask = observed.to(cov.dtype)
         both = mask.unsqueeze(-1) * mask.unsqueeze(-2)
         at_reset = reset.to(cov.dtype).unsqueeze(-1)

@@ -94,7 +94,7 @@ class PolicyStep(nn.Module):
             model = filter.state_space()
         self.form = choose_form(model)
         self.filter = filter if self.form == "loop" else None
-        self.state_dim, self.dtype = filter.state_dim, filter.initial_mean.dtype
+        self.state_dim = filter.state_dim
         for name, limit in (("action_low", action_low), ("action_high", action_high)):
             self.register_buffer(name, None if limit is None else limit.detach().clone())
         if self.form != "loop":
@@ -115,10 +115,12 @@ class PolicyStep(nn.Module):
             self._keep(name, getattr(model, name))
         # H m + B a + d as one product with (m, a).
         self._keep("expectation", torch.cat([model.emission_matrix, model.action_matrix], -1))
-        if self.form == "information":
-            model = model.double()
+        # float64, as in the belief module: what is factorised loses most digits in float32 where R
+        # is small.
+        model = model.double()
         H, Q, P0 = model.emission_matrix, model.transition_cov, model.initial_cov
         assert isinstance(Q, Tensor)
+        self._keep("wide_matrix", H)
         if self.form == "innovation":
             R = model.full_emission_cov()
             self._keep("cross", H @ Q)
@@ -127,8 +129,6 @@ class PolicyStep(nn.Module):
             self._keep("initial_innovation_cov", H @ P0 @ H.mT + R)
             self._keep("eye", torch.eye(H.shape[0], dtype=H.dtype, device=H.device))
         else:
-            # float64, as in the belief module: the factorisation loses digits where R is small.
-            self._keep("matrix", H)
             self._keep("inverse_noise", 1.0 / model.emission_cov)
             self._keep("outer", (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2))
             self._keep("precision", torch.linalg.inv(Q))
@@ -154,9 +154,9 @@ class PolicyStep(nn.Module):
         Returns:
             mean ``(batch, state)`` and age int64 ``(batch, 1)``.
         """
-        device = next(self.buffers(), torch.empty(0)).device
-        mean = torch.zeros(batch, self.state_dim, dtype=self.dtype, device=device)
-        return mean, torch.zeros(batch, 1, dtype=torch.int64, device=device)
+        first = self.get_buffer("initial_mean") if self.filter is None else self.filter.initial_mean
+        mean = first.new_zeros(batch, self.state_dim)
+        return mean, torch.zeros(batch, 1, dtype=torch.int64, device=first.device)
 
     def forward(
         self,
@@ -216,7 +216,8 @@ class PolicyStep(nn.Module):
             torch.cat([m, previous_action], -1), self.get_buffer("expectation"),
             model.emission_offset,
         )  # fmt: skip
-        residual = zero_missing(observation - expected, observed)
+        wide = self.get_buffer("wide_matrix").dtype  # float64, unless the module has been cast
+        residual = zero_missing(observation - expected, observed).to(wide)
         row = reset.unsqueeze(-1)
         # cholesky_ex: its plain form looks at a value on the host to raise.
         if self.form == "innovation":
@@ -230,11 +231,11 @@ class PolicyStep(nn.Module):
             pull = torch.where(
                 reset, z @ self.get_buffer("initial_cross"), z @ self.get_buffer("cross")
             )
-            return m + pull
+            return m + pull.to(m.dtype)
         weight = observed * self.get_buffer("inverse_noise")
         state = m.shape[-1]
-        gathered = (weight @ self.get_buffer("outer")).view(-1, state, state)
+        gathered = (weight @ self.get_buffer("outer")).view(*weight.shape[:-1], state, state)
         prior = torch.where(row, self.get_buffer("initial_precision"), self.get_buffer("precision"))
         factor, _ = torch.linalg.cholesky_ex(gathered + prior)
-        evidence = (weight * residual) @ self.get_buffer("matrix")
+        evidence = (weight * residual) @ self.get_buffer("wide_matrix")
         return m + torch.cholesky_solve(evidence.unsqueeze(-1), factor).squeeze(-1).to(m.dtype)
