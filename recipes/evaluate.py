@@ -63,7 +63,7 @@ def run(config: dict[str, Any]) -> int:
     if len(tasks) < len(wanted):
         say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
     order = [(folder.name, point.name) for folder, point in wanted]
-    processes = config["processes"] or len(os.sched_getaffinity(0))
+    processes = config["processes"] or _cores()
     diverged = []
     for done, (folder, point, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
         if isinstance(rows, DivergedError):
@@ -86,6 +86,12 @@ def run(config: dict[str, Any]) -> int:
             f"diverged there ({', '.join(diverged)}); the others are in {output}."
         )
     return 0
+
+
+def _cores() -> int:
+    """Return how many cores this process may use; all of them where the system does not tell."""
+    allowed = getattr(os, "sched_getaffinity", None)  # not on macOS
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 def _folders(config: dict[str, Any]) -> list[Path]:

@@ -172,7 +172,8 @@ class TransformContract:
 
     def test_transform_model(self):
         transform, data = self.make_transform(), self.make_data((3,))
-        module = TensorDictModule(nn.Linear(OBS, 1), ["observation"], ["value"])
+        obs = data["observation"].shape[-1]
+        module = TensorDictModule(nn.Linear(obs, 1), ["observation"], ["value"])
         if self.offline == "raises":
             with pytest.raises(NotImplementedError, match=type(transform).__name__):
                 nn.Sequential(transform, module)(data)

@@ -377,3 +377,30 @@ def test_a_nan_under_a_true_mask_is_refused(over_time):
         pytest.raises(ValueError, match=r"NaN or inf .* \(components \[3\]\).*ObservedFromNaN"),
     ):
         module(data)
+
+
+# --------------------------------------------------------------------------------------- precision
+@pytest.mark.parametrize("form", ["auto", "innovation", "information", "loop"])
+def test_autocast_leaves_the_filter_in_its_own_dtype(form):
+    """Half precision would lose the filter's digits; what PyTorch casts are the other networks."""
+    written = ["features", ("belief", "log_likelihood"), ("belief", "observation")]
+    module = BeliefFilterModule(make_filter(obs=9, form=form), out_keys=written)
+    data = make_frames((3, 6), obs=9, dtype=torch.float32)
+    data["is_init"][:, 0] = True
+
+    def run(autocast: bool, over_time: bool) -> list[torch.Tensor]:
+        frames = data.clone() if over_time else with_state(data, module.filter.state_dim)[:, 0]
+        with (
+            torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast),
+            set_recurrent_mode(over_time),
+        ):
+            out = module(frames)
+        return [out[key] for key in written]
+
+    for over_time in (True, False):
+        for found, expected in zip(run(True, over_time), run(False, over_time), strict=True):
+            assert found.dtype == torch.float32
+            assert torch.equal(found, expected)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        run(True, True)[0].sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in module.parameters())

@@ -412,6 +412,22 @@ def test_renamed_entries_reach_the_held_losses():
     assert loss.model_loss.tensor_keys.done == ("next", "done")
 
 
+def test_a_flag_named_as_torchrl_names_it_and_a_mask_of_another_name_lose_no_observation():
+    """TorchRL's losses look for `done` inside "next"; the next mask is called what the mask is."""
+    agent, data = make_belief_agent(), make_data()
+    expected = make_loss(agent)(data)
+    loss = make_loss(agent)
+    loss.set_keys(done="done")
+    assert torch.equal(loss(data)["loss_model"], expected["loss_model"])
+    loss.set_keys(observed="mask")
+    for part in (loss, loss.model_loss):
+        assert part.tensor_keys.next_observed == ("next", "mask")
+    loss.set_keys(observed="mask", next_observed=("next", "other"))
+    assert loss.tensor_keys.next_observed == ("next", "other")
+    loss.set_keys(observed=None)
+    assert loss.tensor_keys.next_observed == ("next", "observed")
+
+
 def test_a_filter_with_keys_of_its_own_is_served():
     plain, data = make_belief_agent(), make_data()
     expected = make_loss(plain, detach_belief=True)(data)
@@ -432,9 +448,7 @@ def test_a_filter_with_keys_of_its_own_is_served():
     loss.set_keys(
         features="embed",
         log_likelihood="ll",
-        next_log_likelihood=("next", "ll"),
         observed=("agent", "mask"),
-        next_observed=("next", "agent", "mask"),
         is_init="first",
     )
     out = loss(data)

@@ -415,6 +415,7 @@ VECTOR = spaces.Box(-1, 1, (3,), np.float32)
         (spaces.Dict(a=VECTOR), VECTOR, "vector observation"),
         (VECTOR, spaces.Discrete(3), "discrete actions"),
         (VECTOR, IMAGE, "continuous action"),
+        (VECTOR, spaces.Box(-np.inf, np.inf, (2,), np.float32), "finite limits"),
     ],
 )
 def test_spaces_that_are_not_vectors_are_refused(observation_space, action_space, match):

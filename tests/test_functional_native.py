@@ -128,6 +128,16 @@ def test_without_a_library_auto_runs_pytorch_and_native_says_why(
     assert not list(forgetful.rglob("*.so"))
 
 
+def test_without_a_home_there_is_no_library_and_no_error(forgetful, monkeypatch):
+    def homeless(cls):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(compiled.Path, "home", classmethod(homeless))
+    assert "XDG_CACHE_HOME: Could not determine home" in compiled.native_error()
+    Problem(4, 4).fast("auto")
+
+
 def test_a_library_is_compiled_once(forgetful):
     assert compiled.native_error(torch.float64) is None
     (library,) = forgetful.rglob("*.so")

@@ -13,7 +13,7 @@ import torch
 from contracts import OBS, StaircaseEnv, TransformContract, gym_env, saved, with_transform
 from self_resetting import SelfResettingEnv
 from tensordict import TensorDict
-from torchrl.collectors import MultiSyncCollector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, DoubleToFloat, GymEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -49,6 +49,13 @@ def learn(norm, value, observed=None, **more):
     """Show one batch to the transform, as a step would."""
     data = step_data(value, observed, **more)
     return norm._step(data.empty(), data)
+
+
+def learned(obs):
+    """Return the transform with the statistics of a few steps."""
+    norm = MaskedObservationNorm()
+    learn(norm, *draw(50, obs))
+    return norm
 
 
 def state(norm):
@@ -92,10 +99,22 @@ class TestLearningNormContract(Base):
 
 
 class TestFrozenNormContract(Base):
+    """Its statistics have a shape, so that every environment has as many sensors as gym_env()."""
+
     offline = "works"
 
     def make_transform(self):
-        return MaskedObservationNorm().freeze()
+        return learned(4).freeze()
+
+    def make_data(self, batch, dtype=torch.float32):
+        data = super().make_data(batch, dtype)
+        for key in ("observation", "observed"):
+            data[key] = data[key][..., :4]
+        return data
+
+    def make_batched_env(self):
+        env = TransformedEnv(StaircaseEnv(obs=4), Compose())
+        return env.append_transform(ObservationMissingness("mcar", 0.5))
 
 
 # ----------------------------------------------------------------------- learning in environments
@@ -547,3 +566,26 @@ def test_a_replay_buffer_is_normalised_by_a_frozen_copy_alone():
     torch.testing.assert_close(drawn["next", "observation"], expected, **TIGHT)
     assert torch.equal(drawn["action"], raw["action"])
     assert same(state(frozen), before)
+
+
+def test_frozen_without_statistics_it_refuses_instead_of_passing_raw_values_on():
+    """A Collector that wraps the environment clones it: the clone learns, not what it was given."""
+    env = TransformedEnv(StaircaseEnv(), MaskedObservationNorm())
+    collector = Collector(env, frames_per_batch=6, total_frames=6, max_frames_per_traj=4)
+    for _ in collector:
+        pass
+    assert collector.env is not env
+    test = TransformedEnv(StaircaseEnv(), env.transform.frozen_copy())
+    with pytest.raises(RuntimeError, match=r"frozen but has no statistics.*`collector\.env`"):
+        test.reset()
+    norm = next(t for t in collector.env.transform if isinstance(t, MaskedObservationNorm))
+    TransformedEnv(StaircaseEnv(), norm.frozen_copy()).reset()
+
+
+def test_a_default_device_elsewhere_does_not_reach_the_statistics():
+    norm, plain = MaskedObservationNorm(), MaskedObservationNorm()
+    value, observed = draw(50, 3, dtype=torch.float32)
+    with torch.device("meta"):
+        learn(norm, value, observed)
+    learn(plain, value, observed)
+    assert same(state(norm), state(plain))

@@ -202,12 +202,25 @@ def test_the_complete_observation_is_that_of_the_clean_environment():
 def test_a_state_carries_the_mechanism_and_refuses_another_environment():
     first = ObservationMissingness("nmar", 0.5, mechanism_seed=1)
     staircase(first).rollout(3)
-    second = ObservationMissingness("nmar", 0.5, mechanism_seed=9)
+    second = ObservationMissingness("nmar", 0.5, seed=9, mechanism_seed=1)
     second.load_state_dict(saved(first.state_dict()))
     assert all(map(torch.equal, first.mechanism_parameters, second.mechanism_parameters))
     env = TransformedEnv(StaircaseEnv(obs=7), second)
     with pytest.raises(ValueError, match=r"must have 5 components .* another environment"):
         env.reset()
+
+
+def test_a_state_of_another_mechanism_seed_is_refused():
+    first = ObservationMissingness("mar", 0.5, mechanism_seed=1)
+    staircase(first).rollout(3)
+    other = ObservationMissingness("mar", 0.5, mechanism_seed=9)
+    before = other.seed
+    with pytest.raises(ValueError, match="mechanism_seed 1, this transform has mechanism_seed 9"):
+        other.load_state_dict(saved(first.state_dict()))
+    assert other.seed == before
+    assert other.mechanism_parameters is None or not torch.equal(
+        other.mechanism_parameters.bias, first.mechanism_parameters.bias
+    )
 
 
 def test_a_state_of_another_mechanism_leaves_the_mechanism_alone():

@@ -85,6 +85,15 @@ class Base(TransformContract):
             assert torch.equal(after["reward"], before["reward"])
 
 
+def learned(**options):
+    """Return the transform with the statistics of a few rewards."""
+    transform = scaled(**options)
+    reward = torch.randn(50, 1, generator=torch.Generator().manual_seed(0))
+    root = TensorDict(discounted_return=torch.zeros(50, 1), batch_size=50)
+    transform._step(root, TensorDict(reward=reward, batch_size=50))
+    return transform
+
+
 class TestLearningScaleContract(Base):
     refused_in_workers = "RunningReturnScale cannot learn inside a SerialEnv or ParallelEnv"
 
@@ -96,7 +105,7 @@ class TestFrozenScaleContract(Base):
     offline = "works"
 
     def make_transform(self):
-        return scaled().freeze()
+        return learned().freeze()
 
 
 # ----------------------------------------------------------------------------------------- values
@@ -118,7 +127,7 @@ def test_it_is_the_reward_over_the_spread_of_independently_computed_returns(wher
 
 
 def test_a_step_in_a_worker_reads_the_return_that_it_is_given():
-    env = SerialEnv(2, lambda: TransformedEnv(RewardEnv(), scaled().freeze()))
+    env = SerialEnv(2, lambda: TransformedEnv(RewardEnv(), learned().freeze()))
     assert "discounted_return" in env.full_state_spec.keys(True, True)
     root = env.reset()
     root["discounted_return"] = torch.full_like(root["discounted_return"], 100.0)
@@ -296,7 +305,7 @@ def _trained_state():
 
 # --------------------------------------------------------------------------------------- refusals
 def test_learning_in_the_worker_of_a_collector_is_refused():
-    env = TransformedEnv(RewardEnv(), scaled())
+    env = TransformedEnv(RewardEnv(), learned())
     # what a multi-process collector builds in each of its workers
     options = {"frames_per_batch": 3, "total_frames": 3, "worker_idx": 0}
     with pytest.raises(RuntimeError, match=r"RunningReturnScale.*worker processes of a multi-proc"):

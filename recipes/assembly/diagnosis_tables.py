@@ -27,8 +27,8 @@ class Resampling:
     Entries of one episode hang together, those of two do not: whole episodes are drawn (the
     bootstrap over clusters), and a number is a ratio of sums over the drawn ones. Of few episodes
     the 95 % percentiles are too narrow (91 % of ten); the interval takes those that a Student
-    interval of a mean would reach: :math:`\Phi(\mp t_{n-1} \sqrt{n / (n - 1)})`, the expanded percentile
-    interval of Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015.
+    interval of a mean would reach: :math:`\Phi(\mp t_{n-1} \sqrt{n / (n - 1)})`, the expanded
+    percentile interval of Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015.
 
     Args:
         episodes: how many there are.

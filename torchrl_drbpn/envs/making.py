@@ -106,7 +106,8 @@ def check_spaces(env_id: str, observation: object, action: object) -> None:
         action: its action space.
 
     Raises:
-        ValueError: where one of them is not a Box of floats with one dimension.
+        ValueError: where one of them is not a Box of floats with one dimension, or an action has
+            no limit.
     """
     if (
         not isinstance(observation, gymnasium.spaces.Box)
@@ -125,6 +126,11 @@ def check_spaces(env_id: str, observation: object, action: object) -> None:
         raise ValueError(
             f"`{env_id}` must have a continuous action (a Box of floats with one dimension), got "
             f"{action}: discrete actions are not supported."
+        )
+    if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
+        raise ValueError(
+            f"`{env_id}` must have an action with finite limits, got {action}: a policy's action "
+            "is scaled into them."
         )
 
 

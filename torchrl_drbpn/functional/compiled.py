@@ -72,8 +72,11 @@ def load_library(dtype: torch.dtype, source: str = "native") -> ctypes.CDLL:
     file = _FOLDER / f"{source}.c"
     text = "\n".join([*command, platform.machine(), *_texts(file)])
     name = f"{source}-{_REALS[dtype]}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.so"
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    path = Path(cache) / "torchrl_drbpn" / name
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError as error:
+        raise NativeError(f"name a folder for it in XDG_CACHE_HOME: {error}") from error
+    path = Path(home) / "torchrl_drbpn" / name
     try:
         if not path.is_file():
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -153,7 +156,7 @@ def spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor] | None:
         return None
     matrix = matrix.contiguous()
     inverse, log_det = torch.empty_like(matrix), matrix.new_empty(matrix.shape[:-2])
-    scratch = torch.empty(3 * n * n * 8, dtype=torch.float64)
+    scratch = torch.empty(3 * n * n * 8, dtype=torch.float64, device=matrix.device)
     load_library(dtype).spd_inverse(
         ctypes.c_long(n),
         ctypes.c_long(log_det.numel()),

@@ -100,10 +100,8 @@ class NativeRecurrence(torch.autograd.Function):
         library = load_library(x.dtype)
         counts = (ctypes.c_int64 * 3)()
         library.sizes(dims, counts)
-        tape, scratch, ll = (
-            torch.empty(shape, dtype=torch.float64)
-            for shape in (counts[0], counts[1], (batch, time))
-        )
+        tape, scratch = (x.new_empty(count, dtype=torch.float64) for count in counts[:2])
+        ll = x.new_empty(batch, time, dtype=torch.float64)
         mean = x.new_empty(batch, time, state)
         _call(
             library.forward,

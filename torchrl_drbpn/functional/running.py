@@ -107,8 +107,8 @@ def learn_native(
         double = value.double() if value.shape == (count, n) else value.reshape(count, n).double()
         spread, mean = torch.var_mean(double, 0, correction=0)
     else:
-        filled = torch.empty(count, n, dtype=torch.float64)
-        batch_count = torch.empty(n, dtype=torch.float64)
+        filled = torch.empty(count, n, dtype=torch.float64, device=value.device)
+        batch_count = torch.empty(n, dtype=torch.float64, device=value.device)
         seen = None if observed is None else observed.data_ptr()
         flags = None if rows is None else rows.data_ptr()
         work, found = filled.data_ptr(), batch_count.data_ptr()
@@ -116,7 +116,7 @@ def learn_native(
         mean = filled.sum(0)
         native.deviate(count, n, seen, flags, found, mean.data_ptr(), work)
         spread = filled.sum(0)
-    out = torch.empty(4, *before.n.shape, dtype=torch.float64)
+    out = torch.empty(4, *before.n.shape, dtype=torch.float64, device=value.device)
     if not native.merge(
         count,
         n,

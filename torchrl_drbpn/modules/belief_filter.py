@@ -17,6 +17,7 @@ from torchrl_drbpn.functional import (
     filter_step,
     predict_step,
 )
+from torchrl_drbpn.functional.gaussian import in_autocast
 from torchrl_drbpn.functional.model import Form, checked_form
 from torchrl_drbpn.modules.state_space import (
     CovKind,
@@ -156,7 +157,13 @@ class BeliefFilter(nn.Module):
 
     def state_space(self) -> StateSpace:
         """Return the model's tensors, built from the parameters (differentiable)."""
-        return self._state_space() if self._shared is None else self._shared
+        if self._shared is not None:
+            return self._shared
+        if in_autocast(self.initial_mean):
+            # Q = L L' in half precision is no covariance.
+            with torch.autocast(self.initial_mean.device.type, enabled=False):
+                return self._state_space()
+        return self._state_space()
 
     @contextmanager
     def shared_state_space(self) -> Iterator[StateSpace]:

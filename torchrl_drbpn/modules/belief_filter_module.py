@@ -16,6 +16,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torchrl_drbpn.functional import StateSpace, tril_to_vector
+from torchrl_drbpn.functional.gaussian import in_autocast
 from torchrl_drbpn.modules._keys import read_entry, read_in_keys, read_out_keys
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 
@@ -158,6 +159,10 @@ class BeliefFilterModule(TensorDictModuleBase):
     def _write(
         self, tensordict: TensorDictBase, sequence: bool, model: StateSpace | None
     ) -> TensorDictBase:
+        parameter = self.filter.initial_mean
+        if in_autocast(parameter):
+            with torch.autocast(parameter.device.type, enabled=False):  # see filter_step
+                return self._write(tensordict, sequence, model)
         observation, observed, action, is_init = (
             read_entry(tensordict, self.in_keys, i) for i in range(4)
         )
@@ -273,13 +278,13 @@ class BeliefFilterModule(TensorDictModuleBase):
             >>> ("recurrent", "mean") in primer.primers.keys(True)
             True
         """
-        parameter = self.filter.initial_mean
+        # No device, as in TorchRL's own: an environment that has one moves the primer to it, one
+        # without (device=None) resets on the CPU, whatever the policy runs on.
+        dtype = self.filter.initial_mean.dtype
         return TensorDictPrimer(
             {
-                self.in_keys[4]: Unbounded(
-                    (self.filter.state_dim,), dtype=parameter.dtype, device=parameter.device
-                ),
-                self.in_keys[5]: Unbounded((1,), dtype=torch.int64, device=parameter.device),
+                self.in_keys[4]: Unbounded((self.filter.state_dim,), dtype=dtype),
+                self.in_keys[5]: Unbounded((1,), dtype=torch.int64),
             },
             expand_specs=True,
         )

@@ -213,9 +213,9 @@ class ParticleFilterModule(TensorDictModuleBase):
         particles, log_weight, age = self.in_keys[4:]
         return TensorDictPrimer(
             {
-                particles: Unbounded(shape, dtype=weight.dtype, device=weight.device),
-                log_weight: Unbounded(shape[:1], dtype=weight.dtype, device=weight.device),
-                age: Unbounded((1,), dtype=torch.int64, device=weight.device),
+                particles: Unbounded(shape, dtype=weight.dtype),
+                log_weight: Unbounded(shape[:1], dtype=weight.dtype),
+                age: Unbounded((1,), dtype=torch.int64),
             },
             expand_specs=True,
         )

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -88,6 +88,15 @@ class BeliefModelLoss(LossModule):
         names = [field.name for field in fields(self._AcceptedKeys)]
         self.set_keys(**dict(zip(names, value, strict=False)))
 
+    def set_keys(self, **kwargs: Any) -> None:
+        """Rename entries.
+
+        Args:
+            kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default. See
+                :func:`following_keys` for what renaming one means for its next one.
+        """
+        super().set_keys(**following_keys(kwargs))
+
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Do nothing: this loss estimates no value."""
 
@@ -153,6 +162,29 @@ class BeliefModelLoss(LossModule):
                 mask = mask.reshape(like.shape)
                 valid = mask if valid is None else valid & mask
         return valid
+
+
+def following_keys(names: dict[str, Any]) -> dict[str, Any]:
+    """Complete what the keys of an observation are called by what those of the next one are.
+
+    A flag ``done`` lies inside "next", where TorchRL's losses look for it: the root's tells what
+    happened before. The next mask and the next likelihood are called what the root's are.
+
+    Args:
+        names: accepted names and keys; None restores a default.
+
+    Returns:
+        The same, completed.
+    """
+    out = dict(names)
+    done = unravel_key(out["done"]) if out.get("done") is not None else None
+    if done is not None and not (isinstance(done, tuple) and done[0] == "next"):
+        out["done"] = unravel_key(("next", done))
+    for name in ("observed", "log_likelihood"):
+        if name in out and f"next_{name}" not in out:
+            key = out[name]
+            out[f"next_{name}"] = None if key is None else unravel_key(("next", key))
+    return out
 
 
 def last_steps(

@@ -18,7 +18,7 @@ from torchrl.objectives.utils import ValueEstimators
 from torchrl_drbpn.modules import BeliefFilter, BeliefFilterModule
 from torchrl_drbpn.objectives._clipped import plain_heads, plain_terms
 from torchrl_drbpn.objectives._filtered import filtered_terms
-from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, last_steps
+from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, following_keys, last_steps
 
 __all__ = ["DRBPNLoss"]
 
@@ -125,7 +125,9 @@ class DRBPNLoss(LossModule):
         """Rename entries, here and in the held losses.
 
         Args:
-            kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default.
+            kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default. A
+                ``done`` is looked for inside "next", with or without that word; a next mask is
+                called what the mask is unless it is named too.
 
         Raises:
             ValueError: for an unknown name.
@@ -134,6 +136,7 @@ class DRBPNLoss(LossModule):
         unknown = sorted(set(kwargs) - mine)
         if unknown:
             raise ValueError(f"{unknown} are no keys of DRBPNLoss; it accepts {sorted(mine)}.")
+        kwargs = following_keys(kwargs)
         super().set_keys(**kwargs)
         for part in (self.ppo_loss, self.model_loss):
             if part is not None:

@@ -301,6 +301,13 @@ class RunningScaleTransform(OrderedTransform):
         moments = self._running[index]
         event_shape = value.shape[batch_dims:]
         if moments.count.shape != event_shape:
+            if self._frozen and not moments.count.numel():
+                raise RuntimeError(
+                    f"{type(self).__name__} is frozen but has no statistics: it would leave "
+                    f"`{self.in_keys[index]}` as it is. Freeze it after it has learned, or load a "
+                    "state. A Collector may hold a copy of the environment that it was given: the "
+                    "statistics are then those of `collector.env`."
+                )
             moments.initialise(event_shape, value.device)
         return moments
 

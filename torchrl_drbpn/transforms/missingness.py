@@ -244,6 +244,7 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
         if self._parameters_drawn is not None:
             state |= {f"mechanism.{k}": v for k, v in self._parameters_drawn._asdict().items()}
             state["mechanism.kind"] = torch.tensor(_KINDS.index(self.mechanism))
+            state["mechanism.seed"] = torch.tensor(self.mechanism_seed)
         return state
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
@@ -254,10 +255,21 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
 
         Args:
             state: seed, generator state, parameters.
+
+        Raises:
+            ValueError: the state is that of the same mechanism with another `mechanism_seed`.
         """
-        super().set_extra_state(state)
         kind = state.get("mechanism.kind")
-        if kind is not None and _KINDS[int(kind)] == self.mechanism:
+        same = kind is not None and _KINDS[int(kind)] == self.mechanism
+        drawn_by = state.get("mechanism.seed")
+        if same and drawn_by is not None and int(drawn_by) != self.mechanism_seed:
+            raise ValueError(
+                f"the state is that of mechanism_seed {int(drawn_by)}, this transform has "
+                f"mechanism_seed {self.mechanism_seed}: they lose other sensors. Build it with "
+                "that seed, or load the state of the normaliser alone."
+            )
+        super().set_extra_state(state)
+        if same:
             self._parameters_drawn = MissingnessMechanism(
                 *(state[f"mechanism.{name}"].cpu() for name in MissingnessMechanism._fields)
             )
