@@ -83,7 +83,8 @@ def run(config: dict[str, Any]) -> int:
     if diverged:
         raise UserError(
             f"{len(diverged)} of {len(wanted)} points have no return, as the agent's belief "
-            f"diverged there ({', '.join(diverged)}); the others are in {output}."
+            f"diverged there ({', '.join(diverged)}); the others are in {output}. Train with as "
+            "much missing as that, or leave these points out with points=[...]."
         )
     return 0
 

@@ -434,6 +434,21 @@ class BeliefModuleContract(BeliefFrames):
         for spec in primer.primers.values(True, True):
             assert spec.device is None or spec.device.type == "cpu"
 
+    def test_what_a_missing_entry_holds_changes_neither_values_nor_gradient(self):
+        outputs, grads = [], []
+        for junk in (0.0, 7.0, float("nan"), float("inf")):
+            module = self.make_module(dtype=torch.float64)
+            data = self.make_frames((3, 5), torch.float64)
+            data["observation"] = torch.where(data["observed"], data["observation"], junk)
+            with set_recurrent_mode(True):
+                out = module(data)
+            (out["features"].sum() + out["belief", "log_likelihood"].sum()).backward()
+            outputs.append(torch.cat([out[key].flatten() for key in self.written(module)]).detach())
+            grads.append(torch.cat([p.grad.flatten() for p in module.parameters()]))
+        for output, grad in zip(outputs[1:], grads[1:], strict=True):
+            assert torch.equal(output, outputs[0])
+            assert torch.equal(grad, grads[0])
+
     @pytest.mark.gpu
     @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
     def test_it_moves_to_a_gpu(self):

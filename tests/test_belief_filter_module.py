@@ -251,20 +251,6 @@ def test_no_tensor_is_made_on_another_device(state, cov_network, stored, over_ti
 
 
 # ------------------------------------------------------------------------------- laws of the filter
-def test_what_a_missing_entry_holds_changes_neither_belief_nor_gradient():
-    grads = []
-    for junk in (0.0, 7.0, float("nan"), float("inf")):
-        module = BeliefFilterModule(make_filter(dtype=torch.float64))
-        data = make_frames((3, 5))
-        data["observation"] = torch.where(data["observed"], data["observation"], junk)
-        with set_recurrent_mode(True):
-            out = module(data)
-        (out["features"].sum() + out["belief", "log_likelihood"].sum()).backward()
-        grads.append(torch.cat([p.grad.flatten() for p in module.parameters()]))
-    for grad in grads[1:]:
-        assert torch.equal(grad, grads[0])
-
-
 def test_the_initial_belief_is_learned_through_features_and_through_the_likelihood():
     for key in ("features", ("belief", "log_likelihood")):
         module = BeliefFilterModule(make_filter(dtype=torch.float64))

@@ -71,6 +71,15 @@ def at_the_noise_floor(
     return single, double
 
 
+def assert_gradients_near(differentiate, outputs, differentiate_truth, truth, tolerance):
+    """By every leaf, of mean and likelihood; relative to the norm of the right one."""
+    found = differentiate((outputs[0], outputs[2]))
+    expected = differentiate_truth((truth[0], truth[2]))
+    for name, gradient in found.items():
+        error = (gradient.double() - expected[name]).norm() / expected[name].norm()
+        assert float(error) < tolerance, name
+
+
 @pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
 @pytest.mark.parametrize(("state", "obs"), [(8, 27), (17, 17), (32, 11), (16, 105)], ids=str)
 def test_float32_keeps_its_digits_at_the_noise_floor(state, obs, full_noise):
@@ -80,13 +89,7 @@ def test_float32_keeps_its_digits_at_the_noise_floor(state, obs, full_noise):
     assert float(mean.abs().max()) < 1e-3
     assert float(cov.abs().max()) < 1e-5
     assert float(ll.abs().max()) < 1e-2
-    found, expected = (
-        single.gradients((outputs[0], outputs[2])),
-        double.gradients((truth[0], truth[2])),
-    )
-    for name, gradient in found.items():
-        error = (gradient.double() - expected[name]).norm() / expected[name].norm()
-        assert float(error) < 1e-3, name
+    assert_gradients_near(single.gradients, outputs, double.gradients, truth, 1e-3)
 
 
 @pytest.mark.parametrize("form", ["auto", "innovation", "loop"])
@@ -98,24 +101,15 @@ def test_float32_keeps_its_digits_where_sensors_are_redundant(state, obs, rank, 
     outputs, truth = single.fast(form), double.fast(form)
     for a, e, scale in zip(outputs, truth, (1, max(1, spread**2), obs), strict=True):
         assert float((a.detach().double() - e.detach()).abs().max()) < 2e-5 * scale
-    found, expected = (
-        single.gradients((outputs[0], outputs[2])),
-        double.gradients((truth[0], truth[2])),
-    )
-    for name, gradient in found.items():
-        error = (gradient.double() - expected[name]).norm() / expected[name].norm()
-        assert float(error) < 1e-3, name
+    assert_gradients_near(single.gradients, outputs, double.gradients, truth, 1e-3)
 
 
 @pytest.mark.skipif(native_error(torch.float64) is not None, reason="no C compiler here")
 def test_float64_in_c_keeps_its_digits_at_the_noise_floor():
     _, problem = at_the_noise_floor(16, 105)
     outputs, truth = problem.fast("native"), problem.fast("loop")
-    found, expected = (problem.gradients((out[0], out[2])) for out in (outputs, truth))
     assert float((outputs[2] - truth[2]).detach().abs().max()) < 1e-8
-    for name, gradient in found.items():
-        error = (gradient - expected[name]).norm() / expected[name].norm()
-        assert float(error) < 3e-9, name
+    assert_gradients_near(problem.gradients, outputs, problem.gradients, truth, 3e-9)
 
 
 @pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])

@@ -136,20 +136,6 @@ def test_nothing_observed_leaves_the_ratio_of_transition_and_proposal():
         torch.testing.assert_close(out.log_likelihood[:, t], log_p - log_q)
 
 
-def test_what_a_missing_entry_holds_changes_neither_particles_nor_gradient():
-    grads = []
-    for junk in (0.0, 7.0, float("nan"), float("inf")):
-        module = ParticleFilterModule(make_filter(dtype=torch.float64))
-        data = make_frames((3, 5))
-        data["observation"] = torch.where(data["observed"], data["observation"], junk)
-        with set_recurrent_mode(True):
-            out = module(data)
-        (out["features"].sum() + out["belief", "log_likelihood"].sum()).backward()
-        grads.append(torch.cat([p.grad.flatten() for p in module.parameters()]))
-    for grad in grads[1:]:
-        assert torch.equal(grad, grads[0])
-
-
 def test_the_mask_is_read_too():
     # a zero that arrived is not a zero that did not
     filter = make_filter(dtype=torch.float64)

@@ -226,7 +226,7 @@ class Results:
 
 def evaluate_point(
     folder: Path, point: Point, modes: Sequence[str], protocol: Protocol
-) -> list[dict[str, Any]]:
+) -> list[dict[str, Any]] | DivergedError:
     """Evaluate one run at one point.
 
     Args:
@@ -236,10 +236,7 @@ def evaluate_point(
         protocol: how.
 
     Returns:
-        One row an episode and kind of action.
-
-    Raises:
-        DivergedError: where the agent's belief diverges there.
+        One row an episode and kind of action, or the error of an agent whose belief diverges there.
     """
     torch.set_num_threads(protocol.threads)
     trained = agent_of(folder)
@@ -258,17 +255,8 @@ def evaluate_point(
             rows += [row | {"seed": protocol.seed} | drawn for row in found]
     except BeliefDivergedError as error:
         # Such as an agent that was trained without the likelihood of its model.
-        raise DivergedError(f"{folder.name} has no return at {point.name}: {error}") from error
+        return DivergedError(f"{folder.name} has no return at {point.name}: {error}")
     return rows
-
-
-def _evaluated(
-    folder: Path, point: Point, modes: Sequence[str], protocol: Protocol
-) -> list[dict[str, Any]] | DivergedError:
-    try:
-        return evaluate_point(folder, point, modes, protocol)
-    except DivergedError as error:
-        return error
 
 
 @lru_cache(maxsize=1)
@@ -302,12 +290,12 @@ def evaluate_tasks(
     if processes <= 1:
         agent_of.cache_clear()  # the folder may have got another checkpoint since
         for folder, point, modes in tasks:
-            yield folder, point, _evaluated(folder, point, modes, protocol)
+            yield folder, point, evaluate_point(folder, point, modes, protocol)
         return
     # A fresh interpreter each: a fork would inherit torch's threads and half-held locks.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
-        futures = {pool.submit(_evaluated, *task, protocol): task for task in tasks}
+        futures = {pool.submit(evaluate_point, *task, protocol): task for task in tasks}
         try:
             for future in as_completed(futures):
                 folder, point, _ = futures[future]

@@ -21,7 +21,6 @@ from torch import Tensor
 from torchrl_drbpn.functional.gaussian import (
     LOG_2PI,
     check_observed,
-    in_autocast,
     masked_cov,
     zero_missing,
 )
@@ -36,6 +35,7 @@ from torchrl_drbpn.functional.model import (
     predict_step,
 )
 from torchrl_drbpn.functional.native import NativeRecurrence, native_refusal
+from torchrl_drbpn.functional.precision import outside_autocast
 from torchrl_drbpn.functional.recurrence import (
     InformationRecurrence,
     InnovationRecurrence,
@@ -66,6 +66,7 @@ class FilterOutput(NamedTuple):
     log_likelihood: Tensor
 
 
+@outside_autocast
 def filter_step(
     model: StateSpace,
     mean: Tensor,
@@ -108,13 +109,6 @@ def filter_step(
         >>> bool((out.mean == 1).all()), bool((out.log_likelihood == 0).all())
         (True, True)
     """
-    if in_autocast(mean):
-        # A filter in half precision would lose every digit, and its fast forms mix their dtypes.
-        with torch.autocast(mean.device.type, enabled=False):
-            return filter_step(
-                model, mean, previous_action, observation, observed, reset,
-                return_cov=return_cov, form=form,
-            )  # fmt: skip
     check_observed(observation, observed)
     chosen = checked_form(model, form)
     if (
@@ -205,6 +199,7 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
     return update(prior, nothing, observed, H, R).cov
 
 
+@outside_autocast
 def filter_sequence(
     model: StateSpace,
     mean: Tensor,
@@ -258,12 +253,6 @@ def filter_sequence(
         >>> out.mean.shape, out.log_likelihood.shape
         (torch.Size([4, 10, 2]), torch.Size([4, 10]))
     """
-    if in_autocast(mean):
-        with torch.autocast(mean.device.type, enabled=False):  # see filter_step
-            return filter_sequence(
-                model, mean, previous_action, observation, observed, reset, restart=restart,
-                restart_mean=restart_mean, return_cov=return_cov, form=form,
-            )  # fmt: skip
     chosen = checked_form(model, form)
     check_observed(observation, observed)
     if (restart is None) != (restart_mean is None):

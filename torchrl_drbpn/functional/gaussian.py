@@ -13,7 +13,6 @@ __all__ = [
     "Belief",
     "check_observed",
     "full_cov",
-    "in_autocast",
     "inverse_softplus",
     "masked_cov",
     "masked_log_density",
@@ -139,25 +138,6 @@ def masked_log_density(residual: Tensor, cov: Tensor, observed: Tensor) -> Tenso
     log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     count = observed.sum(-1).to(residual.dtype)
     return -0.5 * (white.square().sum(-1) + log_det + count * LOG_2PI)
-
-
-def in_autocast(tensor: Tensor) -> bool:
-    """Tell whether torch.autocast would cast operations on a tensor.
-
-    Args:
-        tensor: any.
-
-    Returns:
-        False on a device that knows no autocast.
-
-    Example:
-        >>> import torch
-        >>> with torch.autocast("cpu", dtype=torch.bfloat16):
-        ...     in_autocast(torch.ones(2)), in_autocast(torch.ones(2, device="meta"))
-        (True, False)
-    """
-    device = tensor.device.type
-    return torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
 
 
 def inverse_softplus(value: Tensor) -> Tensor:

@@ -19,7 +19,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchrl_drbpn.functional.compiled import spd_inverse
-from torchrl_drbpn.functional.gaussian import LOG_2PI, in_autocast
+from torchrl_drbpn.functional.gaussian import LOG_2PI
+from torchrl_drbpn.functional.precision import outside_autocast
 
 __all__ = ["ACTIVATIONS", "InformationRecurrence", "InnovationRecurrence", "MeanNetwork"]
 
@@ -320,14 +321,12 @@ class InnovationRecurrence(torch.autograd.Function):
         return m, mean, ll
 
     @staticmethod
+    @outside_autocast
     @once_differentiable
     def backward(
         ctx: Any, g_m: Tensor | None, g_mean: Tensor | None, g_ll: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         """Return the gradient of every input of ``forward``, in its order."""
-        if in_autocast(ctx.saved_tensors[0]):  # filter_sequence switches it off for forward
-            with torch.autocast(ctx.saved_tensors[0].device.type, enabled=False):
-                return InnovationRecurrence.backward(ctx, g_m, g_mean, g_ll)
         reset, restart, inverse, gain, z, m, inputs, H, first = ctx.saved_tensors[:9]
         residual, activation, count = ctx.network
         rest, layers = ctx.saved_tensors[9 : 9 + count], ctx.saved_tensors[9 + count :]
@@ -439,12 +438,10 @@ class InformationRecurrence(torch.autograd.Function):
         return mean, ll
 
     @staticmethod
+    @outside_autocast
     @once_differentiable
     def backward(ctx: Any, g_mean: Tensor | None, g_ll: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return the gradient of every input of ``forward``, in its order."""
-        if in_autocast(ctx.saved_tensors[0]):  # filter_sequence switches it off for forward
-            with torch.autocast(ctx.saved_tensors[0].device.type, enabled=False):
-                return InformationRecurrence.backward(ctx, g_mean, g_ll)
         reset, restart, C, D, wide, delta, left, pull, weight, H, noise = ctx.saved_tensors[:11]
         inputs, first = ctx.saved_tensors[11:13]
         residual, activation, count = ctx.network

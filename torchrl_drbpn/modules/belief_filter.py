@@ -17,8 +17,8 @@ from torchrl_drbpn.functional import (
     filter_step,
     predict_step,
 )
-from torchrl_drbpn.functional.gaussian import in_autocast
 from torchrl_drbpn.functional.model import Form, checked_form
+from torchrl_drbpn.functional.precision import outside_autocast
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
@@ -157,13 +157,7 @@ class BeliefFilter(nn.Module):
 
     def state_space(self) -> StateSpace:
         """Return the model's tensors, built from the parameters (differentiable)."""
-        if self._shared is not None:
-            return self._shared
-        if in_autocast(self.initial_mean):
-            # Q = L L' in half precision is no covariance.
-            with torch.autocast(self.initial_mean.device.type, enabled=False):
-                return self._state_space()
-        return self._state_space()
+        return self._state_space() if self._shared is None else self._shared
 
     @contextmanager
     def shared_state_space(self) -> Iterator[StateSpace]:
@@ -186,6 +180,7 @@ class BeliefFilter(nn.Module):
         finally:
             self._shared = before
 
+    @outside_autocast
     def _state_space(self) -> StateSpace:
         transition = self.transition
         mean: MeanNetwork | Callable[[Tensor, Tensor], Tensor]

@@ -16,7 +16,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torchrl_drbpn.functional import StateSpace, tril_to_vector
-from torchrl_drbpn.functional.gaussian import in_autocast
+from torchrl_drbpn.functional.precision import outside_autocast
 from torchrl_drbpn.modules._keys import read_entry, read_in_keys, read_out_keys
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 
@@ -156,13 +156,10 @@ class BeliefFilterModule(TensorDictModuleBase):
         """
         return self._write(tensordict, False, model)
 
+    @outside_autocast
     def _write(
         self, tensordict: TensorDictBase, sequence: bool, model: StateSpace | None
     ) -> TensorDictBase:
-        parameter = self.filter.initial_mean
-        if in_autocast(parameter):
-            with torch.autocast(parameter.device.type, enabled=False):  # see filter_step
-                return self._write(tensordict, sequence, model)
         observation, observed, action, is_init = (
             read_entry(tensordict, self.in_keys, i) for i in range(4)
         )
