@@ -332,6 +332,12 @@ def test_a_float32_belief_at_the_noise_floor_has_the_scores_of_float64(
         error, S = innovation(Belief(m, P.expand(20, -1, -1)), reading, seen, H, R)
         scores.append((normalised_squared(error, S, seen), log_score(error, S, seen)))
     torch.testing.assert_close(scores[0], scores[1], rtol=1e-9, atol=1e-9)
+    # What comes in float32 is scored in float64 too: the same as of the rounded numbers.
+    error, S = 3 * randn(20, obs, seed=5), spd(obs, torch.Generator().manual_seed(6))
+    rounded = error.float(), S.float(), seen
+    widened = error.float().double(), S.float().double(), seen
+    for score in (normalised_squared, log_score):
+        assert torch.equal(score(*rounded), score(*widened))
     assert 0.8 < float(scores[1][0].sum() / seen.sum()) < 1.2
 
 
