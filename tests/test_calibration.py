@@ -143,6 +143,8 @@ def test_a_constant_covariance_is_too_sure_in_outages_which_its_average_nis_does
     case = (0.5, 20.0, False)
     _, observation, observed = constant_covariance.simulate(model, case, 60, 80, seed=0)
     cov = constant_covariance.trained_cov(model, observation, observed, iterations=60)
+    exact_cov = model.transition_cov
+    assert isinstance(exact_cov, torch.Tensor)
     data = constant_covariance.simulate(model, case, 60, 80, seed=1)
     found = {
         name: {
@@ -150,14 +152,18 @@ def test_a_constant_covariance_is_too_sure_in_outages_which_its_average_nis_does
             for key, per in (("nees", "entries"), ("nis", "dof"), ("se", "entries"))
         }
         for name, sums in (
-            ("constant", constant_covariance.judge(model, cov, *data)),
-            ("exact", constant_covariance.judge(model, None, *data)),
+            ("constant", constant_covariance.judge(model, cov, *data, propagated=False)),
+            ("exact", constant_covariance.judge(model, exact_cov, *data, propagated=True)),
+            ("mistaken", constant_covariance.judge(model, cov, *data, propagated=True)),
         )
     }
     assert found["exact"]["nees"] == pytest.approx(1, abs=0.1)
     assert found["constant"]["nees"] > 1.4
     assert found["constant"]["se"] > 1.05 * found["exact"]["se"]
     assert found["constant"]["nis"] == pytest.approx(1, abs=0.15)
+    # What was trained as the whole covariance is no Q: propagated, it is too modest.
+    assert found["mistaken"]["nees"] < 0.85
+    assert found["mistaken"]["nis"] < 0.85
 
 
 # Masks -------------------------------------------------------------------------------------------
