@@ -40,7 +40,7 @@ def make_collector(env: TransformedEnv, policy: object, frames: int) -> Collecto
         frames_per_batch=frames,
         total_frames=-1,
         track_traj_ids=False,
-        use_buffers=False,
+        use_buffers=True,
         auto_register_policy_transforms=False,
     )
 

@@ -98,7 +98,7 @@ def assemble(settings: Settings) -> Training:
         frames_per_batch=settings.collector.frames,
         total_frames=-1,
         track_traj_ids=False,
-        use_buffers=False,
+        use_buffers=True,
         auto_register_policy_transforms=False,
         pre_collect_hook=policy.refresh,
     )
@@ -147,7 +147,8 @@ def train_rollout(
     """
     progress = training.progress
     remaining = max(0.0, 1 - progress.frames / settings.total_frames)
-    data = training.collector.rollout()
+    # The collector writes every rollout into the same tensors; what is entered here is not its own.
+    data = training.collector.rollout().copy()
     add_advantages(data, training.agent, training.gae)
     progress.frames += data.numel()
     finished = _finished_episodes(data, progress.frames)
