@@ -320,7 +320,7 @@ def test_bad_overrides_are_refused_before_anything_is_started(tmp_path: Path) ->
 def test_a_file_is_no_place_for_a_study(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     for path in (tmp_path / "file", tmp_path / "file" / "study"):
-        with pytest.raises(UserError, match="`folder` must be a folder.*file` is a file"):
+        with pytest.raises(UserError, match=r"`folder` must be a folder.*file` is a file"):
             StudyFolder(path)
 
 

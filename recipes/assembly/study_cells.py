@@ -49,7 +49,7 @@ class StudyFolder:
         """Refuse a path that can not be a folder."""
         present = next(p for p in (self.path, *self.path.absolute().parents) if p.exists())
         if not present.is_dir():
-            raise UserError(f"`folder` must be a folder, or be free for one: `{present}` is a file.")
+            raise UserError(f"`folder` must be a folder or free for one; `{present}` is a file.")
 
     def run_folder(self, cell: Cell) -> Path:
         """Return the run folder of a cell."""
