@@ -34,7 +34,7 @@ _REALS = {torch.float32: "float", torch.float64: "double"}
 _MACHINE_FLAGS = {"AVX512": ["-march=x86-64-v4"], "AVX2": ["-march=x86-64-v3"]}
 # Without errno and traps roots and choices become vector instructions; sums keep their order.
 _FLAGS = ["-O3", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"]
-# moments.c gives the bits of PyTorch's operations, each of which is rounded by itself.
+# moments.c scales as PyTorch does, each of whose operations is rounded by itself.
 _OWN_FLAGS = {"moments": ["-ffp-contract=off"]}
 
 

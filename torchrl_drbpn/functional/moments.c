@@ -1,7 +1,7 @@
-/* What RunningMoments does at every step of every environment, between the sums that PyTorch makes:
- * statistics.py's masked_moments, merge_moments and variance, then (x - mean) / sqrt(var + eps).
- * Every operation is rounded as PyTorch rounds it (this file is compiled without contraction), so
- * that both forms give the same bits. running.py calls it; x is [rows, n], all else [n].
+/* What RunningMoments does at every step of every environment: statistics.py's masked_moments,
+ * merge_moments and variance, then (x - mean) / sqrt(var + eps), in float64. Scaling is rounded as
+ * PyTorch rounds it (this file is compiled without contraction); the sums have an order of their
+ * own. running.py calls it; x is [rows, n], all else [n].
  */
 #include <math.h>
 #include <stdint.h>
@@ -16,52 +16,36 @@ static inline int counts(const uint8_t *observed, const uint8_t *row, long r, lo
     return (!observed || observed[i]) && (!row || row[r]);
 }
 
-/* What counts, 0 elsewhere; how much of it there is. */
-void moments_fill(long rows, long n, const real *x, const uint8_t *observed, const uint8_t *row,
-                  double *filled, double *count) {
-    for (long j = 0; j < n; j++) count[j] = 0;
+/* Merge what counts of a batch into count, mean and m2, in two passes over it; out: the new three
+ * and the scale, at first the batch's own. 0: something that counts is not finite. */
+int moments_learn(long rows, long n, double eps, const real *x, const uint8_t *observed,
+                  const uint8_t *row, const double *count, const double *mean, const double *m2,
+                  double *out_count, double *out_mean, double *out_m2, double *inverse_scale) {
+    double all = 0;
+    for (long j = 0; j < n; j++) out_count[j] = out_mean[j] = out_m2[j] = 0;
     for (long r = 0; r < rows; r++)
         for (long j = 0; j < n; j++) {
             long i = r * n + j;
             int counted = counts(observed, row, r, i);
-            filled[i] = counted ? (double)x[i] : 0.0;
-            count[j] += counted;
+            out_count[j] += counted;
+            out_mean[j] += counted ? (double)x[i] : 0.0;
         }
-}
-
-/* The batch's mean from its sum, in place; the squared deviations in the place of the values. */
-void moments_deviate(long rows, long n, const uint8_t *observed, const uint8_t *row,
-                     const double *count, double *mean, double *filled) {
-    for (long j = 0; j < n; j++) mean[j] /= count[j] < 1 ? 1 : count[j];
+    for (long j = 0; j < n; j++) out_mean[j] /= out_count[j] < 1 ? 1 : out_count[j];
     for (long r = 0; r < rows; r++)
         for (long j = 0; j < n; j++) {
             long i = r * n + j;
-            double d = counts(observed, row, r, i) ? filled[i] - mean[j] : 0.0;
-            filled[i] = d * d;
+            double d = counts(observed, row, r, i) ? (double)x[i] - out_mean[j] : 0.0;
+            out_m2[j] += d * d;
         }
-}
-
-/* Merge a batch into count, mean, m2; out: the new three and the scale. 0: something not finite.
- * Without counts of its own the batch has `rows` samples of everything and variances, no sums. */
-int moments_merge(long rows, long n, double eps, const double *count, const double *mean,
-                  const double *m2, const double *batch_count, const double *batch_mean,
-                  const double *spread, double *out) {
-    double all = 0, factor = batch_count ? 1 : rows;
-    for (long j = 0; j < n; j++) all += spread[j] * factor;
+    for (long j = 0; j < n; j++) all += out_m2[j];
     if (!isfinite(all)) return 0;
     for (long j = 0; j < n; j++) {
-        double added = batch_count ? batch_count[j] : rows, batch_m2 = spread[j] * factor;
-        double total = count[j] + added, delta = batch_mean[j] - mean[j];
+        double added = out_count[j], total = count[j] + added, delta = out_mean[j] - mean[j];
         double shift = added / (total < 1 ? 1 : total) * delta;
-#ifdef __FMA__ /* as PyTorch's addcmul where the processor has it */
-        double sum = fma(delta * count[j], shift, batch_m2 + m2[j]);
-#else
-        double sum = (batch_m2 + m2[j]) + delta * count[j] * shift;
-#endif
-        out[j] = total;
-        out[n + j] = shift + mean[j];
-        out[2 * n + j] = sum;
-        out[3 * n + j] = 1.0 / sqrt((total < 2 ? 1.0 : sum / total) + eps);
+        out_count[j] = total;
+        out_mean[j] = mean[j] + shift;
+        out_m2[j] += m2[j] + delta * count[j] * shift;
+        inverse_scale[j] = 1.0 / sqrt((total < 2 ? 1.0 : out_m2[j] / total) + eps);
     }
     return 1;
 }

@@ -1,9 +1,8 @@
-"""Running statistics in few calls: ``moments.c`` around the two sums that PyTorch makes.
+"""Running statistics in two calls of ``moments.c``: one that learns, one that scales.
 
-For the observations of sixteen robots, learning and scaling are some thirty operations on a few
-hundred numbers, and what is paid for is their number. The C code does what lies between the sums,
-rounded as PyTorch rounds it; the sums stay PyTorch's, whose order depends on the processor. Both
-forms therefore give the same bits. Where the C code cannot be had, PyTorch's operations run.
+For the observations of sixteen robots they are some thirty operations on a few hundred numbers, and
+what is paid for is their number. Both forms compute in float64; sums are rounded in another order.
+Where the C code cannot be had, PyTorch's operations run.
 """
 
 from __future__ import annotations
@@ -79,7 +78,7 @@ def learn_native(
 ) -> RunningNumbers | None:
     """Merge the observed entries of the flagged rows of a batch into running statistics.
 
-    The same as ``masked_moments``, ``merge_moments`` and ``variance``, bit for bit.
+    The same as ``masked_moments``, ``merge_moments`` and ``variance``, but for the order of sums.
 
     Args:
         before: the statistics so far, shape ``(*event)``, contiguous.
@@ -100,38 +99,24 @@ def learn_native(
     """
     native = _load(value.dtype)
     n = before.n.numel()
-    count = value.numel() // n if n else 0
-    found = None
-    if observed is None and rows is None:
-        # PyTorch's own sums again: var_mean goes through the data once, in an order of its own.
-        double = value.double() if value.shape == (count, n) else value.reshape(count, n).double()
-        spread, mean = torch.var_mean(double, 0, correction=0)
-    else:
-        filled = torch.empty(count, n, dtype=torch.float64, device=value.device)
-        batch_count = torch.empty(n, dtype=torch.float64, device=value.device)
-        seen = None if observed is None else observed.data_ptr()
-        flags = None if rows is None else rows.data_ptr()
-        work, found = filled.data_ptr(), batch_count.data_ptr()
-        native.fill(count, n, value.data_ptr(), seen, flags, work, found)
-        mean = filled.sum(0)
-        native.deviate(count, n, seen, flags, found, mean.data_ptr(), work)
-        spread = filled.sum(0)
-    out = torch.empty(4, *before.n.shape, dtype=torch.float64, device=value.device)
-    if not native.merge(
-        count,
+    count, mean, m2, inverse_scale = (torch.empty_like(before.n) for _ in range(4))
+    if not native.learn(
+        value.numel() // n if n else 0,
         n,
         eps,
+        value.data_ptr(),
+        None if observed is None else observed.data_ptr(),
+        None if rows is None else rows.data_ptr(),
         before.n.data_ptr(),
         before.mean.data_ptr(),
         before.m2.data_ptr(),
-        found,
+        count.data_ptr(),
         mean.data_ptr(),
-        spread.data_ptr(),
-        out.data_ptr(),
+        m2.data_ptr(),
+        inverse_scale.data_ptr(),
     ):
         return None
-    *moments, inverse_scale = out.unbind()
-    return RunningNumbers(Moments(*moments), inverse_scale)
+    return RunningNumbers(Moments(count, mean, m2), inverse_scale)
 
 
 def scale_native(
@@ -179,9 +164,7 @@ def scale_native(
 
 # ------------------------------------------------------------------------------------- the C code
 class _Functions(NamedTuple):
-    fill: ctypes._NamedFuncPointer
-    deviate: ctypes._NamedFuncPointer
-    merge: ctypes._NamedFuncPointer
+    learn: ctypes._NamedFuncPointer
     scale: ctypes._NamedFuncPointer
 
 
@@ -195,16 +178,8 @@ def _load(dtype: torch.dtype) -> _Functions:
     """Return the functions for values of a dtype, with the types of their arguments."""
     library = load_library(dtype, "moments")
     whole, real, at = ctypes.c_long, ctypes.c_double, ctypes.c_void_p
-    out = _Functions(
-        library.moments_fill,
-        library.moments_deviate,
-        library.moments_merge,
-        library.moments_scale,
-    )
-    out.fill.argtypes = [whole, whole, *[at] * 5]
-    out.deviate.argtypes = [whole, whole, *[at] * 5]
-    out.merge.argtypes = [whole, whole, real, *[at] * 7]
+    out = _Functions(library.moments_learn, library.moments_scale)
+    out.learn.argtypes = [whole, whole, real, *[at] * 10]
     out.scale.argtypes = [whole, whole, real, *[at] * 5]
-    for function in (out.fill, out.deviate, out.scale):
-        function.restype = None
+    out.scale.restype = None
     return out
