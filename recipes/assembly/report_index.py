@@ -14,7 +14,8 @@ from assembly.report_runs import trained_on
 
 _HEAD = """# Results
 
-One folder a study, each made by one command from finished run folders, none left out. Its
+One folder a study, each made by one command from the run folders beside it; its notes say what is
+missing or was added. Its
 `README.md` holds the tables, the commands from nothing to the page, and the versions; the CSV files
 beside it hold every seed's own numbers and what the figures were drawn from.
 
