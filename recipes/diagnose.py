@@ -37,6 +37,8 @@ from assembly.settings import check_mode, missingness_name
 from assembly.trained import TrainedAgent, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
 
+from torchrl_drbpn import BeliefDivergedError
+
 _FIGURES = ("precision.png", "outages.png", "reliability.png")
 
 
@@ -83,6 +85,8 @@ def run(config: dict[str, Any]) -> int:
         sigma = trained.settings.noise.sigma
         kind = (common["task"], common["point"], common["method"], common["trained_on"], sigma)
         series.setdefault(kind, []).append(tally)
+    if not precision:
+        raise UserError("no point is left: every belief diverged, see above. Name other `points`.")
     out.mkdir(parents=True, exist_ok=True)
     write_table(out / "precision.csv", csv_cells(precision))
     for name, rows in (("calibration.csv", calibration), ("reliability.csv", reliability)):
@@ -144,21 +148,26 @@ def _diagnoses(
             )
         texts = [str(point) for point in config["points"]]
         for point in parse_points(texts, trained.settings, float(config["spike_std"])):
-            tally = diagnose(
+            removed = removed_sensors(
+                point,
                 trained,
-                point.missingness,
-                noise=point.noise,
-                removed=removed_sensors(
-                    point,
-                    trained,
-                    episodes=config["episodes"],
-                    reduction_seed=config["reduction_seed"],
-                ),
                 episodes=config["episodes"],
-                mode=config["mode"],
-                seed=config["seed"],
-                bins=config["bins"],
+                reduction_seed=config["reduction_seed"],
             )
+            try:
+                tally = diagnose(
+                    trained,
+                    point.missingness,
+                    noise=point.noise,
+                    removed=removed,
+                    episodes=config["episodes"],
+                    mode=config["mode"],
+                    seed=config["seed"],
+                    bins=config["bins"],
+                )
+            except BeliefDivergedError as error:
+                say(f"{folder.name}, {point.name}: no rows, {error}")
+                continue
             say(_summary(folder, point, tally))
             yield folder, trained, point, tally
 

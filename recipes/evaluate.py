@@ -19,7 +19,6 @@ from assembly.belief_figure import save_figure
 from assembly.console import say, start
 from assembly.errors import UserError
 from assembly.evaluation_grid import (
-    DivergedError,
     Grid,
     Protocol,
     Results,
@@ -64,12 +63,7 @@ def run(config: dict[str, Any]) -> int:
         say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
     order = [(folder.name, point.name) for folder, point in wanted]
     processes = config["processes"] or _cores()
-    diverged = []
     for done, (folder, point, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
-        if isinstance(rows, DivergedError):
-            diverged.append(f"{folder.name} at {point.name}")
-            say(f"{done}/{len(tasks)} {rows}")
-            continue
         results.add(folder.name, point.name, rows)
         say(f"{done}/{len(tasks)} {folder.name} {point.name}: {_summary(rows)}")
     results.arrange(order)
@@ -80,12 +74,6 @@ def run(config: dict[str, Any]) -> int:
             path = output.with_name(f"{output.stem}-{task}.png")
             save_figure(figure, path, dpi=120)
             say(f"written: {path}")
-    if diverged:
-        raise UserError(
-            f"{len(diverged)} of {len(wanted)} points have no return, as the agent's belief "
-            f"diverged there ({', '.join(diverged)}); the others are in {output}. Train with as "
-            "much missing as that, or leave these points out with points=[...]."
-        )
     return 0
 
 
@@ -174,6 +162,8 @@ def _summary(rows: Sequence[dict[str, Any]]) -> str:
     for mode in dict.fromkeys(row["mode"] for row in rows):
         returns = [row["return"] for row in rows if row["mode"] == mode]
         parts.append(f"{mode} {sum(returns) / len(returns):.1f}")
+    if stopped := sum(row["diverged"] for row in rows):
+        parts.append(f"belief diverged in {stopped} of {len(rows)} episodes")
     return ", ".join(parts)
 
 

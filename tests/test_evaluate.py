@@ -29,10 +29,11 @@ import evaluate as recipe
 from assembly import evaluation_grid
 from assembly.errors import UserError
 from assembly.evaluation import Episodes
-from assembly.evaluation_grid import DivergedError, Grid, evaluate_tasks, grid_points
+from assembly.evaluation_grid import Grid, agent_of, evaluate_tasks, grid_points
 from assembly.points import Point, evaluate_points, parse_point, removed_sensors
 from assembly.robustness_figure import draw_robustness, mean_interval, read_rows
 from assembly.run import run as train
+from assembly.run_folder import write_table
 from assembly.sensor_choice import kept_sensors
 from assembly.sensor_groups import sensor_groups
 from assembly.sensors import named_tasks, sensor_names
@@ -41,7 +42,7 @@ from assembly.trained import TrainedAgent, load_trained_agent
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from torchrl_drbpn import BeliefDivergedError, BeliefFilter
+from torchrl_drbpn import BeliefFilter, GymnasiumBatchEnv
 from torchrl_drbpn.functional import draw_mechanism
 
 SMOKE = (
@@ -227,9 +228,9 @@ def test_random_reduction_does_not_draw_what_training_never_lost(
 
 def test_a_small_share_of_one_entry_weighs_as_what_it_is() -> None:
     """In two episodes one entry of 100 arrived in all: its likelihood is that of the evaluation."""
-    few = Episodes([0.0, 0.0], [10, 10], [0.99, 1.0], [-2.5, 0.0])
+    few = Episodes([0.0, 0.0], [10, 10], [0.99, 1.0], [-2.5, 0.0], [False, False])
     assert few.log_likelihood == pytest.approx(-2.5)
-    assert Episodes([0.0], [10], [1.0], [0.0]).log_likelihood == 0.0
+    assert Episodes([0.0], [10], [1.0], [0.0], [False]).log_likelihood == 0.0
 
 
 # The grid -------------------------------------------------------------------------------------
@@ -331,37 +332,69 @@ def test_two_processes_give_the_numbers_of_one(
     assert list(evaluate_tasks([], None, 2)) == []  # type: ignore[arg-type]
 
 
-def test_an_agent_whose_belief_diverges_at_a_point_is_named_with_it(
+def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def diverge(*_: Any, **__: Any) -> Any:
-        raise BeliefDivergedError("the belief is no longer finite.")
+    point = parse_point("mcar:0.5", settings, spike_std=5.0)
+    protocol = evaluation_grid.Protocol(3, ["sampled"], 1, 5.0, 0, 1)
+    ((_, _, expected),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+    step, calls, actions = BeliefFilter.step, [], []
+
+    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+        out = step(self, *args, **options)
+        calls.append(len(calls))
+        if len(calls) == 3:  # the second robot's belief, at its third step
+            out.mean[1] = torch.nan
+        return out
+
+    def look(env: GymnasiumBatchEnv, *arrays: Any) -> None:
+        actions.append(arrays[1].copy())
+        advance(env, *arrays)
+
+    advance = GymnasiumBatchEnv._advance
+    monkeypatch.setattr(BeliefFilter, "step", diverge)
+    monkeypatch.setattr(GymnasiumBatchEnv, "_advance", look)
+    ((_, _, found),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+    assert [row["diverged"] for row in found] == [0, 1, 0]
+    assert found[1]["log_likelihood"] is None
+    assert np.isfinite([row["return"] for row in found]).all()
+    for row in (0, 2):
+        assert found[row] == expected[row]
+    assert found[1]["return"] != expected[1]["return"]
+    stopped = np.stack(actions)[2 : found[1]["length"], 1]
+    assert len(stopped) > 0
+    assert (stopped == 0).all()
+    assert (np.stack(actions)[:2, 1] != 0).all()
+    assert agent_of(drbpn).agent.belief.filter.validate  # who asks by himself is told
+
+
+def test_the_next_evaluation_begins_with_every_robot(
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, left = BeliefFilter.step, [1]
+
+    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+        out = step(self, *args, **options)
+        if left:
+            left.pop()
+            out.mean[:] = torch.inf
+        return out
 
     monkeypatch.setattr(BeliefFilter, "step", diverge)
-    protocol = evaluation_grid.Protocol(2, ["sampled"], 1, 5.0, 0, 1)
-    tasks = [(drbpn, parse_point("mcar:0.8", settings, spike_std=5.0), ["sampled"])]
-    ((_, _, outcome),) = evaluate_tasks(tasks, protocol, 1)
-    assert isinstance(outcome, DivergedError)
-    assert str(outcome) == "drbpn has no return at mcar:0.8: the belief is no longer finite."
+    rows = evaluate(tmp_path / "out.csv", drbpn, points="none:0")
+    shares = {m: {row["diverged"] for row in rows if row["mode"] == m} for m in ("sampled", "mean")}
+    assert shares == {"sampled": {"1"}, "mean": {"0"}}
 
 
-@pytest.mark.parametrize("points", ["'mcar:0.8',none:0", "'mcar:0.8'"])
-def test_a_point_where_a_belief_diverges_keeps_no_other_from_being_evaluated(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: str
+def test_tables_without_room_for_stopped_episodes_are_gone_on_with(
+    drbpn: Path, tmp_path: Path
 ) -> None:
-    def diverging(trained: TrainedAgent, points: list[Point], **how: Any) -> Any:
-        if points[0].name == "mcar:0.8":
-            raise BeliefDivergedError("the belief is no longer finite.")
-        return evaluate_points(trained, points, **how)
-
-    monkeypatch.setattr(evaluation_grid, "evaluate_points", diverging)
     out = tmp_path / "out.csv"
-    expected = rf"1 of {points.count(':')} points have no return, .*\(drbpn at mcar:0\.8\)"
-    with pytest.raises(UserError, match=expected):
-        evaluate(out, drbpn, points=points, figures=True)
-    monkeypatch.undo()
-    rows = evaluate(out, drbpn, points=points)
-    assert {row["point"] for row in rows} == set(points.replace("'", "").split(","))
+    rows = evaluate(out, drbpn, points="none:0")
+    write_table(out, [{k: v for k, v in row.items() if k != "diverged"} for row in rows])
+    again = evaluate(out, drbpn, points="none:0,'mcar:0.5'")
+    assert again[: len(rows)] == rows
+    assert {row["diverged"] for row in again} == {"0"}
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import pytest
 import recipe_tools  # noqa: F401  (puts recipes/ on the path)
 from assembly.report_statistics import interquartile_mean, interval
 
@@ -18,12 +19,28 @@ def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side() -> None:
 
 
 def test_the_interval_of_few_runs_is_that_of_every_resample() -> None:
-    means = sorted(np.mean(runs) for runs in itertools.product([1.0, 2.0, 6.0], repeat=3))
     ends = interval([[6.0, 1.0, 2.0]])
     assert ends is not None
-    np.testing.assert_allclose(ends, np.percentile(means, [2.5, 97.5]), rtol=1e-12)
+    # One of 27 resamples is three times the lowest run: more than one in forty.
+    assert [float(end) for end in ends] == [1.0, 6.0]
+    five = np.array([3.0, -1.0, 4.0, 1.0, -5.0])
+    resamples = (sorted(runs) for runs in itertools.product(five, repeat=5))
+    means = sorted(np.mean(runs[1:4]) for runs in resamples)
+    ends = interval([five])
+    assert ends is not None
+    # The 79th lowest of 3125 is the first that at least 2.5 % do not exceed.
+    np.testing.assert_allclose(ends, [means[78], means[-79]], rtol=1e-12)
     assert interval([[1.0]]) is None
     assert interval([[1.0, 2.0], [1.0]]) is None  # of one run nothing can be told
+
+
+@pytest.mark.parametrize(("runs", "share"), [(2, 0.5), (3, 0.75), (5, 0.9)])
+def test_how_often_the_interval_of_few_runs_holds_the_true_mean(runs: int, share: float) -> None:
+    """What the pages say about their intervals."""
+    data = np.random.default_rng(runs).normal(size=(runs, 4000))
+    ends = interval([data])
+    assert ends is not None
+    assert ((ends[0] <= 0) & (ends[1] >= 0)).mean() == pytest.approx(share, abs=0.03)
 
 
 def test_runs_are_resampled_within_their_stratum() -> None:

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from assembly.errors import UserError
+from torchrl_drbpn import BeliefDivergedError
 
 _USER_ERROR = 2
 
@@ -110,6 +111,7 @@ def run_or_explain(job: Callable[[], int]) -> int:
     """
     try:
         return job()
-    except UserError as error:
+    # Such as an agent without its sensors, whose learned model then runs open loop.
+    except (UserError, BeliefDivergedError) as error:
         sys.stderr.write(f"error: {error}\n")
         return _USER_ERROR

@@ -29,12 +29,14 @@ class Episodes:
         lengths: steps of each episode.
         missing_ratios: share of entries that did not arrive in each, over all components.
         log_likelihoods: nats per observed entry in each, normalised units; None without a model.
+        diverged: whether the belief left the range of its numbers and the robot was stopped.
     """
 
     returns: list[float]
     lengths: list[int]
     missing_ratios: list[float]
     log_likelihoods: list[float] | None
+    diverged: list[bool]
 
     @property
     def mean_return(self) -> float:
@@ -56,11 +58,11 @@ class Episodes:
 
     @property
     def log_likelihood(self) -> float | None:
-        """Return the nats per observed entry over all steps; None without a model.
+        """Return the nats per observed entry over all steps; None without a model, or diverged.
 
         0 where nothing arrived.
         """
-        if self.log_likelihoods is None:
+        if self.log_likelihoods is None or any(self.diverged):
             return None
         ratios = zip(self.missing_ratios, self.lengths, strict=True)
         weights = [(1 - ratio) * length for ratio, length in ratios]
@@ -158,6 +160,7 @@ def _first_episodes(
     lengths = torch.zeros(count, 1, dtype=torch.int64)
     observed = torch.zeros(count, 1, dtype=torch.int64)
     log_likelihood = torch.zeros(count, 1, dtype=torch.float64)
+    diverged = torch.zeros(count, 1, dtype=torch.bool)
     components, has_model = 0, False
     root = env.reset()
     while running.any():
@@ -172,6 +175,9 @@ def _first_episodes(
         if value is not None:
             has_model = True
             log_likelihood += value.reshape(count, 1) * running
+        stopped = stepped.get("diverged", None)
+        if stopped is not None:
+            diverged |= stopped & running
         returns += stepped.get(("next", "reward")) * running
         lengths += running
         running = running & ~stepped.get(("next", "done"))
@@ -183,4 +189,5 @@ def _first_episodes(
         lengths.squeeze(-1).tolist(),
         missing.squeeze(-1).tolist(),
         per_entry.squeeze(-1).tolist() if has_model else None,
+        diverged.squeeze(-1).tolist(),
     )

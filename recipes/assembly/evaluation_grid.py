@@ -25,7 +25,6 @@ from assembly.points import Point, episode_rows, evaluate_points, parse_point
 from assembly.run_folder import write_table
 from assembly.settings import Settings
 from assembly.trained import TrainedAgent, load_trained_agent
-from torchrl_drbpn import BeliefDivergedError
 
 Row = Mapping[str, Any]
 
@@ -35,10 +34,6 @@ _COLUMNS = {
     *("trained_noise_sigma", "point", "removed_by", "mode", "episode", "seed", "reduction_seed"),
 }
 _AGAIN = "name another `output`, or overwrite=true begins anew."
-
-
-class DivergedError(UserError):
-    """Name an agent and the point where its belief left the range of its numbers."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +141,7 @@ class Results:
         if rows and not rows[0].keys() >= _COLUMNS:
             raise UserError(f"`{path}` is no table of this command, or of an earlier one: {_AGAIN}")
         for row in rows:
+            row.setdefault("diverged", "0")  # earlier tables had no room for such episodes
             key = row["run"], row["point"], row["mode"]
             self._points.setdefault(key, []).append(row)
         for (run, point, _), found in self._points.items():
@@ -226,7 +222,7 @@ class Results:
 
 def evaluate_point(
     folder: Path, point: Point, modes: Sequence[str], protocol: Protocol
-) -> list[dict[str, Any]] | DivergedError:
+) -> list[dict[str, Any]]:
     """Evaluate one run at one point.
 
     Args:
@@ -236,26 +232,22 @@ def evaluate_point(
         protocol: how.
 
     Returns:
-        One row an episode and kind of action, or the error of an agent whose belief diverges there.
+        One row an episode and kind of action.
     """
     torch.set_num_threads(protocol.threads)
     trained = agent_of(folder)
     drawn = {"reduction_seed": protocol.reduction_seed if point.selection == "random" else None}
     rows = []
-    try:
-        for _, mode, result in evaluate_points(
-            trained,
-            [point],
-            episodes=protocol.episodes,
-            modes=modes,
-            seed=protocol.seed,
-            reduction_seed=protocol.reduction_seed,
-        ):
-            found = episode_rows(trained, point, mode, result, run=folder.name)
-            rows += [row | {"seed": protocol.seed} | drawn for row in found]
-    except BeliefDivergedError as error:
-        # Such as an agent that was trained without the likelihood of its model.
-        return DivergedError(f"{folder.name} has no return at {point.name}: {error}")
+    for _, mode, result in evaluate_points(
+        trained,
+        [point],
+        episodes=protocol.episodes,
+        modes=modes,
+        seed=protocol.seed,
+        reduction_seed=protocol.reduction_seed,
+    ):
+        found = episode_rows(trained, point, mode, result, run=folder.name)
+        rows += [row | {"seed": protocol.seed} | drawn for row in found]
     return rows
 
 
@@ -274,7 +266,7 @@ def agent_of(folder: Path) -> TrainedAgent:
 
 def evaluate_tasks(
     tasks: Sequence[tuple[Path, Point, Sequence[str]]], protocol: Protocol, processes: int
-) -> Iterator[tuple[Path, Point, list[dict[str, Any]] | DivergedError]]:
+) -> Iterator[tuple[Path, Point, list[dict[str, Any]]]]:
     """Evaluate points of runs, several at a time; the numbers do not depend on how many.
 
     Args:
@@ -283,8 +275,7 @@ def evaluate_tasks(
         processes: at a time; 1: in this process.
 
     Yields:
-        Folder, point and rows, as they come; in place of the rows the error of an agent that
-        diverged there, which keeps no other point from being evaluated.
+        Folder, point and rows, as they come.
     """
     processes = min(processes, len(tasks))
     if processes <= 1:

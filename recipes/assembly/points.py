@@ -24,6 +24,7 @@ from assembly.settings import (
     check_outages,
     missingness_name,
 )
+from assembly.stopping import StoppingPolicy
 from assembly.trained import TrainedAgent
 
 _MECHANISMS = ("none", "mcar", "mar", "nmar")
@@ -231,6 +232,7 @@ def evaluate_points(
         removed_sensors(point, trained, episodes=episodes, reduction_seed=reduction_seed)
         for point in points
     ]
+    policy = StoppingPolicy(trained.agent)
     for point, sensors in zip(points, removed, strict=True):
         env = make_evaluation_environment(
             trained.settings,
@@ -242,9 +244,7 @@ def evaluate_points(
             removed=sensors,
         )
         for mode in modes:
-            result = evaluate(
-                trained.agent.policy, env, mode=mode, seed=seed, statistics=trained.statistics
-            )
+            result = evaluate(policy, env, mode=mode, seed=seed, statistics=trained.statistics)
             assert result is not None  # nothing asks it to stop
             yield point, mode, result
         env.close()
@@ -306,7 +306,14 @@ def episode_rows(
         "mode": mode,
     }
     likelihoods: Sequence[float | None] = result.log_likelihoods or [None] * len(result.returns)
-    columns = zip(result.returns, result.lengths, result.missing_ratios, likelihoods, strict=True)
+    columns = zip(
+        result.returns,
+        result.lengths,
+        result.missing_ratios,
+        likelihoods,
+        result.diverged,
+        strict=True,
+    )
     return [
         common
         | {
@@ -314,7 +321,8 @@ def episode_rows(
             "return": value,
             "length": length,
             "missing_ratio": ratio,
-            "log_likelihood": likelihood,
+            "log_likelihood": None if diverged else likelihood,
+            "diverged": int(diverged),
         }
-        for index, (value, length, ratio, likelihood) in enumerate(columns)
+        for index, (value, length, ratio, likelihood, diverged) in enumerate(columns)
     ]

@@ -38,6 +38,7 @@ def evaluations(folder: Path, settings: Settings) -> list[Row]:
         {"source": row["kind"], "point": missingness_name(settings.missingness)}
         | {"table": _OWN_TABLE, "episode_seed": None}
         | {key: row.get(key) for key in _EVALUATED}
+        | {"diverged": None}
         for row in (read_csv(own, needed) if own.is_file() else [])
     ]
     found: dict[tuple[Any, ...], Row] = {}
@@ -88,6 +89,8 @@ def _point(path: Path, key: tuple[Any, ...], found: Sequence[Row]) -> Row:
             else sum(v * w for v, w in zip(likelihoods, arrived, strict=True))
             / max(sum(arrived), 1e-12)
         ),
+        # Episodes in which the belief diverged and the robot was stopped, as a share.
+        "diverged": sum(row.get("diverged") or 0.0 for row in found) / len(found),
     }
 
 

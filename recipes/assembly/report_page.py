@@ -14,7 +14,7 @@ from assembly.report_evaluations import Row
 from assembly.report_paper import THRESHOLDS, task_family
 from assembly.report_runs import StudyRun, grouped, trained_on
 from assembly.report_statistics import interquartile_mean
-from assembly.report_tables import KEPT, format_number
+from assembly.report_tables import DIVERGED, KEPT, format_number
 from assembly.report_variants import mark_best, variant_lines, variant_order
 
 _TRAINING_COLUMNS = (
@@ -96,9 +96,9 @@ FIGURE_TEXTS = {
 _TRAINING_TEXT = (
     "Return: raw, sampled actions, mean of the last 100 training episodes; **interquartile mean** "
     "over seeds [95 % interval] (each seed's own). Of fewer than four seeds the interquartile mean "
-    "is the mean, and the bootstrap interval of three is hardly narrower than their range: it says "
-    "how far they lie apart, not where a fourth would fall. The other columns are means over "
-    "seeds. Missing "
+    "is the mean, and the bootstrap interval is their range: it says how far they lie apart, and "
+    "holds the true mean of normal data in half of all cases with two seeds, in three quarters "
+    "with three. The other columns are means over seeds. Missing "
     "ratio: realised share over all components, mean over the whole run. Log-likelihood: nats per "
     "observed entry, normalised units, mean of the last tenth of the run. Steps/s: whole training "
     "loop, start-up and evaluation excluded, on whatever else the machine was doing."
@@ -110,8 +110,10 @@ _VARIANT_TEXT = (
 )
 _EVALUATION_TEXT = (
     "Mean raw return of the episodes of a seed; **interquartile mean** over seeds [95 % bootstrap "
-    "interval], then what that is of the same agents' return with nothing missing, where that was "
-    "evaluated and is positive. Normalisation frozen, noise as in training. Missing ratio: "
+    "interval], then the mean over seeds of each agent's share of its own return with nothing "
+    "missing, where that was evaluated and is positive, and the share of episodes in which the "
+    "belief diverged, where there are any: such a robot gets zero actions to its end. Empty: not "
+    "evaluated. Normalisation frozen, noise as in training. Missing ratio: "
     "realised share over all components, mean over the methods of the row. A point that was "
     "evaluated both by itself (points.csv) and on the grid (robustness.csv) counts as on the grid; "
     "evaluation.csv names the table and the seed of the episodes."
@@ -231,8 +233,11 @@ def _evaluated(quantities: Mapping[str, Row]) -> str:
     if "evaluation return" not in quantities:
         return ""
     text = with_interval(quantities["evaluation return"])
-    kept = quantities.get(KEPT)
-    return text if kept is None else f"{text} {100 * kept['iqm']:.0f} %"
+    if (kept := quantities.get(KEPT)) is not None:
+        text += f" {100 * kept['iqm']:.0f} %"
+    if (diverged := quantities.get(DIVERGED)) is not None:
+        text += f" (diverged: {100 * diverged['mean']:.0f} %)"
+    return text
 
 
 def _aggregate_table(aggregate: Sequence[Row]) -> str:

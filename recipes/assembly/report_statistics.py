@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 _EXACT = 20_000  # up to so many resamples all are taken: 5 runs, or 3 runs of each of 3 tasks
 _DRAWS = 10_000  # beyond that, so many are drawn
-_COVERAGE = 95.0  # %
+_COVERAGE = 0.95
 
 
 def interquartile_mean(values: Array) -> Array:
@@ -45,6 +45,9 @@ def interval(
 ) -> tuple[Array, Array] | None:
     """Return the 95 % percentile bootstrap interval of a statistic of runs.
 
+    Of two or three runs it is their range, which holds the true mean of normal data in 50 and 75 %
+    of all cases; of five runs in about 90 %.
+
     Args:
         samples: the runs of each stratum, resampled within it; a run is a number, or a row of
             numbers ``(runs, ...)`` that stays together.
@@ -67,8 +70,11 @@ def interval(
         if statistic is None
         else statistic(resampled)
     )
-    tail = (100 - _COVERAGE) / 2
-    low, high = np.percentile(values, [tail, 100 - tail], axis=0)
+    tail = (1 - _COVERAGE) / 2
+    # Quantiles of what there is: between a handful of resamples nothing can be interpolated.
+    low, high = (
+        sign * np.quantile(sign * values, tail, axis=0, method="inverted_cdf") for sign in (1, -1)
+    )
     return low, high
 
 

@@ -77,6 +77,7 @@ _WORDS = {
 }
 NOTHING_MISSING = "none:0"
 KEPT = "evaluation return kept"  # as a share of the return where nothing is missing
+DIVERGED = "evaluation episodes diverged"  # as a share; told where there are any
 # What is summed up about a training run: name, and the number of a run.
 _TRAINING_NUMBERS: dict[str, Callable[[StudyRun], float | None]] = {
     "training return": lambda run: run.training[-1]["return"],
@@ -117,7 +118,23 @@ def summary_rows(runs: Sequence[StudyRun]) -> list[Row]:
                 rows.append(_summary(members, words, point, mode, number))
             if point != NOTHING_MISSING:
                 rows.append(_summary(members, KEPT, point, mode, _kept(point, mode)))
-    return [row for row in rows if row["quantity"] != KEPT or row["mean"] is not None]
+            rows.append(_summary(members, DIVERGED, point, mode, _diverged(point, mode)))
+    return [
+        row
+        for row in rows
+        if not (row["quantity"] == KEPT and row["mean"] is None)
+        and not (row["quantity"] == DIVERGED and not row["mean"])
+    ]
+
+
+def _diverged(point: str, mode: str) -> Callable[[StudyRun], float | None]:
+    """Return what gives the share of a run's episodes that were stopped at a point."""
+
+    def number(run: StudyRun) -> float | None:
+        found = final_evaluation(run, point, mode)
+        return None if found is None else found.get("diverged") or 0.0
+
+    return number
 
 
 def _kept(point: str, mode: str) -> Callable[[StudyRun], float | None]:
