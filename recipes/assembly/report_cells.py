@@ -31,7 +31,7 @@ def with_interval(row: Mapping[str, Any]) -> str:
         row: with ``iqm, low, high``.
 
     Returns:
-        Such as ``**51.00** [50.22, 51.78]``; ``**none**`` where a seed has no number.
+        Such as ``**51.00** [50.00, 52.00]``; ``**none**`` where a seed has no number.
     """
     mean = "none" if row["iqm"] is None else number(row["iqm"])
     if row["low"] is None:
