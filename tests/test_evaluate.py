@@ -572,6 +572,18 @@ def test_the_interval_sees_the_spread_between_runs() -> None:
     assert high - low > 5 * (inner_high - inner_low)
 
 
+def test_the_interval_sees_what_the_episodes_of_all_runs_have_in_common() -> None:
+    generator, hits = np.random.default_rng(1), {True: 0, False: 0}
+    for trial in range(300):
+        common = generator.normal(0.0, 1.0, 30)
+        runs = [(common + generator.normal(0.0, 0.3, 30)).tolist() for _ in range(3)]
+        for shared in hits:
+            _, low, high = mean_interval(runs, seed=trial, shared=shared)
+            hits[shared] += low < 0.0 < high
+    assert hits[True] / 300 > 0.9
+    assert hits[False] / 300 < 0.85  # as if there were three times as many choices
+
+
 def test_a_figure_has_a_panel_a_family_and_both_ratios(drbpn: Path, tmp_path: Path) -> None:
     points = "none:0,'mcar:0.5','reduction:0.5:random','reduction:0.5:model','outages:0.5:2'"
     out = tmp_path / "out.csv"

@@ -419,6 +419,7 @@ def test_the_index_holds_the_tables_of_every_study_beside_the_papers_figures(
     make_run(results / "clean" / "runs" / "a", "experiment=clean", "env.version=v4", points=False)
     noisy = ("experiment=clean", "noise=gaussian", "noise.sigma=0.5", "env.version=v4")
     make_run(results / "clean" / "runs" / "b", *noisy, final=7.0, points=False)
+    (results / "gaps" / "sensors").mkdir()
     run(ASKED | {"index": str(results)})
     clean, gaps = (results / "README.md").read_text().split("\n## ")[1:]
     assert "| Hopper-v4 | `drbpn` | none:0, sigma 0 | 1 | **50.00** | **50.00** | 2000 |" in clean
@@ -429,6 +430,14 @@ def test_the_index_holds_the_tables_of_every_study_beside_the_papers_figures(
     line = "| Hopper-v4 | mar:0.5, sigma 1 | mar:0.5 | `dvrl` | 400 | +25 % | +20 % |"
     assert line in gaps
     assert "paper |" not in gaps.split("margin")[0]  # no threshold beside runs with gaps
+    assert "steps to it" not in gaps
+    _, lines = clean.split("| task | method | top-10 return of each seed | paper's threshold |")
+    (line,) = [line for line in lines.splitlines() if "`drbpn`" in line]
+    assert line.endswith("| 2000 | not reached |")
+    assert "Beside it: [sensors](gaps/sensors/)." in gaps
+    for study, text in (("clean", clean), ("gaps", gaps)):
+        assert (results / study / "learning_curves.png").is_file()
+        assert f"]({study}/learning_curves.png)" in text
 
 
 @pytest.mark.parametrize("study", COMMITTED, ids=lambda path: path.name)

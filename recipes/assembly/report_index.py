@@ -7,8 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from assembly.errors import UserError
-from assembly.report_cells import margin, markdown_table, percent, two_steps, with_interval
+from assembly.report_cells import (
+    margin,
+    markdown_table,
+    number,
+    percent,
+    two_steps,
+    with_interval,
+)
 from assembly.report_evaluations import Row, read_csv
+from assembly.report_page import FIGURE_TEXTS
 from assembly.report_paper import THRESHOLDS, task_family
 from assembly.report_runs import trained_on
 
@@ -28,7 +36,8 @@ python recipes/report.py index=results
 Returns are raw, of sampled actions: **interquartile mean** over seeds [95 % bootstrap interval].
 Training: the last 100 episodes; the other columns: the last checkpoint, evaluated with nothing
 missing (none:0) and with half of all entries missing or open to be (.5). The paper: its threshold
-of the return on complete, exact observations, and its margin over DVRL at ratio .5.
+of the return on complete, exact observations, and its margin over DVRL at ratio .5; its Table 1 has
+more, which its public text does not show.
 
 The run folders hold their last checkpoints, so that an agent can be looked at without training it:
 
@@ -70,7 +79,8 @@ def index_page(folder: Path, studies: Sequence[Path]) -> str:
 
     Returns:
         Markdown: for each study its heading, the first paragraph of its notes.md, and its tables:
-        returns by task and method, and the margins that the paper gives one of too.
+        returns by task and method, the margins that the paper gives one of too, and how soon the
+        paper's thresholds were passed; its figures, and links to what lies beside them.
     """
     parts = [_HEAD.strip()]
     for study in studies:
@@ -79,10 +89,20 @@ def index_page(folder: Path, studies: Sequence[Path]) -> str:
         notes = study / "notes.md"
         if notes.is_file():
             parts.append(notes.read_text(encoding="utf-8").strip().split("\n\n")[0])
-        parts += [_returns(study), _margins(study)]
+        place = study.relative_to(folder)
+        parts += [
+            f"![{FIGURE_TEXTS[name]}]({place}/{name})"
+            for name in _FIGURES
+            if (study / name).is_file()
+        ]
+        parts += [_returns(study), _margins(study), _efficiency(study)]
+        more = [f"[{name}]({place}/{name}/)" for name in _FOLDERS if (study / name).is_dir()]
+        parts.append(f"Beside it: {', '.join(more)}." if more else "")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
+_FIGURES = ("learning_curves.png", "robustness.png")
+_FOLDERS = ("diagnosis", "sensors", "ablations")  # what other commands have left there
 _SHOWN = ("none:0", "mcar:0.5", "mar:0.5")  # points
 _TRAINING = "training return"
 
@@ -135,3 +155,30 @@ def _margins(study: Path) -> str:
     ]
     head = ["task", "trained on", "evaluated on", "over", "steps", "margin of `drbpn`", "paper"]
     return markdown_table(head, rows) if rows else ""
+
+
+def _efficiency(study: Path) -> str:
+    """Return the steps to the paper's thresholds; nothing where data was incomplete."""
+    path = study / "efficiency.csv"
+    needed = {"task", "method", "seed", "top_10_return", "threshold", "steps_to_threshold"}
+    groups: dict[tuple[str, str, float | None], list[Row]] = {}
+    for row in read_csv(path, needed) if path.is_file() else []:
+        method = f"`{row['method']}`" + (f", {row['variant']}" if row.get("variant") else "")
+        groups.setdefault((row["task"], method, row["threshold"]), []).append(row)
+    rows = [
+        [
+            task,
+            method,
+            "; ".join(number(row["top_10_return"]) or "unknown" for row in members),
+            f"{threshold:g}",
+            "; ".join(_steps(row["steps_to_threshold"]) for row in members),
+        ]
+        for (task, method, threshold), members in groups.items()
+        if threshold is not None
+    ]
+    head = ["task", "method", "top-10 return of each seed", "paper's threshold", "steps to it"]
+    return markdown_table(head, rows) if rows else ""
+
+
+def _steps(steps: float | None) -> str:
+    return "not reached" if steps is None else f"{steps:,.0f}"

@@ -97,21 +97,32 @@ def draw_robustness(rows: Sequence[Row]) -> dict[str, Figure]:
     return figures
 
 
-def mean_interval(values: Sequence[Sequence[float]], seed: int = 0) -> tuple[float, float, float]:
+def mean_interval(
+    values: Sequence[Sequence[float]], seed: int = 0, *, shared: bool = False
+) -> tuple[float, float, float]:
     """Return the mean over all values and its 95 % interval by the hierarchical bootstrap.
 
     Args:
         values: of each run, at least one each.
         seed: of the resampling.
 
+    Keyword Args:
+        shared: whether the n-th values of all runs have something in common that was drawn, such as
+            which sensors are gone: they are then drawn anew together, as many for each run.
+
     Returns:
         Mean, lower end, upper end.
     """
     generator = np.random.default_rng(seed)
     runs = [np.asarray(value, dtype=np.float64) for value in values]
+    together = generator.integers(len(runs[0]), size=(_RESAMPLES, 1, len(runs[0])))
     means = np.stack(
         [
-            run[generator.integers(len(run), size=(_RESAMPLES, len(runs), len(run)))].mean(-1)
+            run[
+                np.broadcast_to(together, (_RESAMPLES, len(runs), len(run)))
+                if shared
+                else generator.integers(len(run), size=(_RESAMPLES, len(runs), len(run)))
+            ].mean(-1)
             for run in runs
         ]
     )  # (run, resample, place): a run may be drawn into several places, with other episodes in each
@@ -186,7 +197,7 @@ def _draw_panel(axis: Any, curves: Sequence[Curve], methods: Sequence[str]) -> N
     variants = list(dict.fromkeys(curve.variant for curve in curves))
     for curve in curves:
         levels = sorted(curve.rows)
-        ends = np.array([mean_interval(_by_run(curve.rows[level])) for level in levels])
+        ends = np.array([_interval(curve.rows[level]) for level in levels])
         colour = _COLOURS[methods.index(curve.method) % len(_COLOURS)]
         runs = len({row["run"] for found in curve.rows.values() for row in found})
         label = ", ".join(part for part in (curve.method, curve.variant) if part)
@@ -203,6 +214,12 @@ def _draw_panel(axis: Any, curves: Sequence[Curve], methods: Sequence[str]) -> N
     _realised_axis(axis, curves)
     axis.set_xlabel(curves[0].axis)
     axis.legend(frameon=False, fontsize=8)
+
+
+def _interval(rows: Sequence[Row]) -> tuple[float, float, float]:
+    # The n-th episode of every run lacks the same sensors.
+    shared = all(row["removed_by"] == "random" for row in rows)
+    return mean_interval(_by_run(rows), shared=shared)
 
 
 def _by_run(rows: Sequence[Row]) -> list[list[float]]:
