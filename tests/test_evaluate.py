@@ -332,8 +332,9 @@ def test_two_processes_give_the_numbers_of_one(
     assert list(evaluate_tasks([], None, 2)) == []  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
 def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
-    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
+    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
     point = parse_point("mcar:0.5", settings, spike_std=5.0)
     protocol = evaluation_grid.Protocol(3, ["sampled"], 1, 5.0, 0, 1)
@@ -344,7 +345,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
         out = step(self, *args, **options)
         calls.append(len(calls))
         if len(calls) == 3:  # the second robot's belief, at its third step
-            out.mean[1] = torch.nan
+            out.mean[1] = value
         return out
 
     def look(env: GymnasiumBatchEnv, *arrays: Any) -> None:

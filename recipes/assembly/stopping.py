@@ -13,6 +13,11 @@ from torch import Tensor, nn
 from assembly.agent import Agent
 
 
+# Of features. Observations are normalised: a million deviations from all that was ever seen is no
+# belief any more, and on its way to infinity.
+_FARTHEST = 1e6
+
+
 class StoppingPolicy(TensorDictModuleBase):
     """Write what ``agent.policy`` writes; where the belief has diverged, zero actions to the end.
 
@@ -47,7 +52,8 @@ class StoppingPolicy(TensorDictModuleBase):
         finite = torch.stack(
             [v.isfinite().reshape(len(v), -1).all(1) for v in numbers.values()]
         ).all(0)
-        stopped = ~finite.unsqueeze(-1)
+        near = tensordict.get("features").abs().amax(-1, keepdim=True) < _FARTHEST
+        stopped = ~(finite.unsqueeze(-1) & near)  # NaN is not near
         if self._stopped is not None:
             stopped = stopped | (self._stopped & ~tensordict.get("is_init"))
         self._stopped = stopped
