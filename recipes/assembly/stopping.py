@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from assembly.agent import Agent
 
-
 # Of features. Observations are normalised: a million deviations from all that was ever seen is no
 # belief any more, and on its way to infinity.
 _FARTHEST = 1e6
