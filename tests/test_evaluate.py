@@ -27,6 +27,7 @@ from recipe_tools import ROOT, make_config  # isort: skip
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 from assembly import evaluation_grid
+from assembly.diagnosis import diagnose
 from assembly.errors import UserError
 from assembly.evaluation import Episodes
 from assembly.evaluation_grid import Grid, agent_of, evaluate_tasks, grid_points
@@ -367,6 +368,40 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     assert (stopped == 0).all()
     assert (np.stack(actions)[:2, 1] != 0).all()
     assert agent_of(drbpn).agent.belief.filter.validate  # who asks by himself is told
+
+
+@pytest.mark.parametrize("command", ["evaluate", "diagnose"])
+def test_the_belief_of_an_episode_that_is_over_goes_no_further(
+    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """Fed its last observation for ever it may diverge, and stop an evaluation of others."""
+    step, means, resets = BeliefFilter.step, [], []
+
+    def look(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+        means.append(args[0].clone())
+        resets.append(args[5].clone())
+        return step(self, *args, **options)
+
+    monkeypatch.setattr(BeliefFilter, "step", look)
+    point = parse_point("mcar:0.5", settings, spike_std=5.0)
+    if command == "evaluate":
+        protocol = evaluation_grid.Protocol(4, ["sampled"], 1, 5.0, 0, 1)
+        ((_, _, rows),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+        lengths = [row["length"] for row in rows]
+    else:
+        tally = diagnose(
+            load_trained_agent(drbpn), point.missingness, episodes=4, mode="sampled", seed=1,
+            bins=[1, 2],
+        )  # fmt: skip
+        lengths = tally.lengths.int().tolist()
+    assert len(set(lengths)) > 1
+    assert len(means) == max(lengths)
+    for row, length in enumerate(lengths):
+        reset = torch.stack(resets)[:, row]
+        assert reset[0]
+        assert not reset[1:length].any()
+        assert reset[length:].all()
+        assert (torch.stack(means)[length:, row] == 0).all()
 
 
 def test_the_next_evaluation_begins_with_every_robot(

@@ -29,7 +29,7 @@ from assembly.beliefs import (
 )
 from assembly.environment import copy_statistics
 from assembly.errors import UserError
-from assembly.evaluation import make_evaluation_environment
+from assembly.evaluation import leave_standing, make_evaluation_environment
 from assembly.settings import MissingnessSettings, NoiseSettings
 from assembly.trained import TrainedAgent
 from torchrl_drbpn import seed_env
@@ -185,7 +185,7 @@ def diagnose(
             # An episode that is over costs no simulation.
             stepped = env.step(data.set("_step", running.unsqueeze(-1)))
             running = running & ~stepped.get(("next", "done")).squeeze(-1)
-            data = env.step_mdp(stepped)
+            data = leave_standing(env.step_mdp(stepped), running.unsqueeze(-1))
             if len(held) == chunk or not running.any():
                 steps = {key: torch.stack([row[key] for row in held], 1) for key in held[0]}
                 _add(tally, steps)

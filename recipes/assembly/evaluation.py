@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -150,6 +151,34 @@ def evaluate(
         return _first_episodes(policy, env, stop)
 
 
+def leave_standing(root: TensorDictBase, running: Tensor) -> TensorDictBase:
+    """Let the beliefs of episodes that are over begin anew at every step.
+
+    Such a row is not simulated: the policy sees its last observation again and again, with actions
+    that nobody carries out, and a belief that goes on with that may leave the range of its numbers.
+
+    Args:
+        root: of the next step; changed in place.
+        running: bool of shape ``(episodes, 1)``.
+
+    Returns:
+        The same tensordict.
+    """
+    if running.all():
+        return root
+    root.set("is_init", root.get("is_init") | ~running)
+    carried = root.get("recurrent", None)
+    if carried is not None:
+        rows = running.squeeze(-1)
+
+        def kept(value: Tensor) -> Tensor:
+            over = rows.reshape(-1, *(1,) * (value.ndim - 1))
+            return torch.where(over, value, torch.zeros_like(value))
+
+        root.set("recurrent", carried.apply(kept))
+    return root
+
+
 def _first_episodes(
     policy: TensorDictModuleBase, env: TransformedEnv, stop: Callable[[], bool]
 ) -> Episodes | None:
@@ -181,7 +210,7 @@ def _first_episodes(
         returns += stepped.get(("next", "reward")) * running
         lengths += running
         running = running & ~stepped.get(("next", "done"))
-        root = env.step_mdp(stepped)
+        root = leave_standing(env.step_mdp(stepped), running)
     missing = 1 - observed / (lengths * components).double()
     per_entry = log_likelihood / observed.clamp_min(1)
     return Episodes(
