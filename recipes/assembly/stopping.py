@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -71,7 +72,7 @@ class StoppingPolicy(TensorDictModuleBase):
 @contextmanager
 def _unchecked(belief: nn.Module) -> Iterator[None]:
     """Let a belief write what is not finite, in the place of an error."""
-    checking = [part for part in belief.modules() if getattr(part, "validate", False)]
+    checking: list[Any] = [m for m in belief.modules() if getattr(m, "validate", False)]
     for part in checking:
         part.validate = False
     try:
