@@ -218,7 +218,7 @@ def _draw_panel(axis: Any, curves: Sequence[Curve], methods: Sequence[str]) -> N
 
 def _interval(rows: Sequence[Row]) -> tuple[float, float, float]:
     # The n-th episode of every run lacks the same sensors.
-    shared = all(row["removed_by"] == "random" for row in rows)
+    shared = all(row.get("removed_by") == "random" for row in rows)
     return mean_interval(_by_run(rows), shared=shared)
 
 
