@@ -26,7 +26,6 @@ import diagnose
 from assembly import diagnosis
 from assembly.beliefs import ESTIMATE, FORECAST, FORECAST_COV
 from assembly.checkpoint import save_checkpoint
-from assembly.console import run_or_explain
 from assembly.diagnosis import Forecast, Tally, class_names, pool
 from assembly.diagnosis_figures import Series, draw_outages, outage_figure, read_outages
 from assembly.diagnosis_tables import (
@@ -45,8 +44,6 @@ from assembly.trained import TrainedAgent, load_trained_agent
 from assembly.training import assemble, train_rollout, training_state
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-
-from torchrl_drbpn import BeliefDivergedError
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
 BINS = [1, 2, 3, 6]
@@ -526,38 +523,6 @@ def test_every_point_of_an_evaluation_can_be_diagnosed(
             if row["held_against"] == "reading" and row["steps_since_seen"] == "all"
         }
     assert surprise["spikes:0.5:5"] > 3 * surprise["reduction:0.5:random"]
-
-
-def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
-    folders: dict[str, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    whole = diagnose.diagnose
-
-    def diverging(trained: TrainedAgent, missingness: Any, **how: Any) -> Any:
-        if missingness.eta == 0.8:
-            raise BeliefDivergedError("the belief is no longer finite")
-        return whole(trained, missingness, **how)
-
-    monkeypatch.setattr(diagnose, "diagnose", diverging)
-    assert run(str(folders["drbpn"]), tmp_path, points=["mcar:0.8", "mcar:0.4"]) == 0
-    assert "drbpn, mcar:0.8: no rows, the belief is no longer finite" in capsys.readouterr().out
-    with (tmp_path / "precision.csv").open(newline="") as file:
-        assert {row["point"] for row in csv.DictReader(file)} == {"mcar:0.4"}
-    with pytest.raises(UserError, match="no point is left: every belief diverged"):
-        run(str(folders["drbpn"]), tmp_path, points=["mcar:0.8"])
-
-
-def test_an_error_of_the_filter_is_one_line_of_every_command(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def job() -> int:
-        raise BeliefDivergedError("the belief is no longer finite")
-
-    assert run_or_explain(job) == 2
-    assert capsys.readouterr().err == "error: the belief is no longer finite\n"
 
 
 def test_runs_of_two_methods_are_two_curves(folders: dict[str, Path], tmp_path: Path) -> None:

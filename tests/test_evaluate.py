@@ -22,38 +22,24 @@ import pytest
 import torch
 
 pytest.importorskip("hydra")
+from evaluation_tools import SMOKE, configured, evaluate, trained_folder  # isort: skip
 from recipe_tools import ROOT, make_config  # isort: skip
 
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 from assembly import evaluation_grid
-from assembly.diagnosis import diagnose
 from assembly.errors import UserError
 from assembly.evaluation import Episodes
-from assembly.evaluation_grid import Grid, agent_of, evaluate_tasks, grid_points
+from assembly.evaluation_grid import Grid, evaluate_tasks, grid_points
 from assembly.points import Point, evaluate_points, parse_point, removed_sensors
 from assembly.robustness_figure import draw_robustness, mean_interval, read_rows
-from assembly.run import run as train
-from assembly.run_folder import write_table
 from assembly.sensor_choice import kept_sensors
 from assembly.sensor_groups import sensor_groups
 from assembly.sensors import named_tasks, sensor_names
 from assembly.settings import Settings, read_settings
 from assembly.trained import TrainedAgent, load_trained_agent
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from torchrl_drbpn import BeliefFilter, GymnasiumBatchEnv
 from torchrl_drbpn.functional import draw_mechanism
-
-SMOKE = (
-    "experiment=smoke",
-    "missingness=mcar",
-    "missingness.eta=0.2",
-    "total_frames=128",
-    "evaluation.every_frames=0",
-    "evaluation.final_episodes=0",
-)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,12 +47,6 @@ def _threads() -> Iterator[None]:
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
-
-
-def trained_folder(folder: Path, *overrides: str) -> Path:
-    with torch.random.fork_rng(devices=[]):
-        assert train(make_config(*SMOKE, *overrides), folder) == 0
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -87,21 +67,6 @@ def agent(drbpn: Path) -> TrainedAgent:
 @pytest.fixture(scope="module")
 def settings() -> Settings:
     return read_settings(make_config(*SMOKE))
-
-
-def configured(*overrides: str) -> dict[str, Any]:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        composed = OmegaConf.to_container(compose("evaluate", list(overrides)), resolve=True)
-    assert isinstance(composed, dict)
-    return {str(key): value for key, value in composed.items()}
-
-
-def evaluate(table: Path, *runs: Path, points: str = "", **options: Any) -> list[dict[str, str]]:
-    base = configured(*([f"points=[{points}]"] if points else []))
-    base |= {"run": [str(r) for r in runs], "output": str(table), "processes": 1, "episodes": 2}
-    assert recipe.run(base | {"figures": False} | options) == 0
-    with table.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def parse(text: str, settings: Settings) -> Point:
@@ -333,106 +298,6 @@ def test_two_processes_give_the_numbers_of_one(
     assert list(evaluate_tasks([], None, 2)) == []  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
-def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
-    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, value: float
-) -> None:
-    point = parse_point("mcar:0.5", settings, spike_std=5.0)
-    protocol = evaluation_grid.Protocol(3, ["sampled"], 1, 5.0, 0, 1)
-    ((_, _, expected),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
-    step, calls, actions = BeliefFilter.step, [], []
-
-    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
-        out = step(self, *args, **options)
-        calls.append(len(calls))
-        if len(calls) == 3:  # the second robot's belief, at its third step
-            out.mean[1] = value
-        return out
-
-    def look(env: GymnasiumBatchEnv, *arrays: Any) -> None:
-        actions.append(arrays[1].copy())
-        advance(env, *arrays)
-
-    advance = GymnasiumBatchEnv._advance
-    monkeypatch.setattr(BeliefFilter, "step", diverge)
-    monkeypatch.setattr(GymnasiumBatchEnv, "_advance", look)
-    ((_, _, found),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
-    assert [row["diverged"] for row in found] == [0, 1, 0]
-    assert found[1]["log_likelihood"] is None
-    assert np.isfinite([row["return"] for row in found]).all()
-    for row in (0, 2):
-        assert found[row] == expected[row]
-    assert found[1]["return"] != expected[1]["return"]
-    stopped = np.stack(actions)[2 : found[1]["length"], 1]
-    assert len(stopped) > 0
-    assert (stopped == 0).all()
-    assert (np.stack(actions)[:2, 1] != 0).all()
-    assert agent_of(drbpn).agent.belief.filter.validate  # who asks by himself is told
-
-
-@pytest.mark.parametrize("command", ["evaluate", "diagnose"])
-def test_the_belief_of_an_episode_that_is_over_goes_no_further(
-    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    """Fed its last observation for ever it may diverge, and stop an evaluation of others."""
-    step, means, resets = BeliefFilter.step, [], []
-
-    def look(self: BeliefFilter, *args: Any, **options: Any) -> Any:
-        means.append(args[0].clone())
-        resets.append(args[5].clone())
-        return step(self, *args, **options)
-
-    monkeypatch.setattr(BeliefFilter, "step", look)
-    point = parse_point("mcar:0.5", settings, spike_std=5.0)
-    if command == "evaluate":
-        protocol = evaluation_grid.Protocol(4, ["sampled"], 1, 5.0, 0, 1)
-        ((_, _, rows),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
-        lengths = [row["length"] for row in rows]
-    else:
-        tally = diagnose(
-            load_trained_agent(drbpn), point.missingness, episodes=4, mode="sampled", seed=1,
-            bins=[1, 2],
-        )  # fmt: skip
-        lengths = tally.lengths.int().tolist()
-    assert len(set(lengths)) > 1
-    assert len(means) == max(lengths)
-    for row, length in enumerate(lengths):
-        reset = torch.stack(resets)[:, row]
-        assert reset[0]
-        assert not reset[1:length].any()
-        assert reset[length:].all()
-        assert (torch.stack(means)[length:, row] == 0).all()
-
-
-def test_the_next_evaluation_begins_with_every_robot(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    step, left = BeliefFilter.step, [1]
-
-    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
-        out = step(self, *args, **options)
-        if left:
-            left.pop()
-            out.mean[:] = torch.inf
-        return out
-
-    monkeypatch.setattr(BeliefFilter, "step", diverge)
-    rows = evaluate(tmp_path / "out.csv", drbpn, points="none:0")
-    shares = {m: {row["diverged"] for row in rows if row["mode"] == m} for m in ("sampled", "mean")}
-    assert shares == {"sampled": {"1"}, "mean": {"0"}}
-
-
-def test_tables_without_room_for_stopped_episodes_are_gone_on_with(
-    drbpn: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out.csv"
-    rows = evaluate(out, drbpn, points="none:0")
-    write_table(out, [{k: v for k, v in row.items() if k != "diverged"} for row in rows])
-    again = evaluate(out, drbpn, points="none:0,'mcar:0.5'")
-    assert again[: len(rows)] == rows
-    assert {row["diverged"] for row in again} == {"0"}
-
-
 @pytest.mark.parametrize(
     ("change", "what"),
     [({"episodes": 3}, "with episodes 2, and 3"), ({"seed": 5}, "with seed 10000, and 5")],
@@ -618,6 +483,24 @@ def test_the_interval_sees_what_the_episodes_of_all_runs_have_in_common() -> Non
             hits[shared] += low < 0.0 < high
     assert hits[True] / 300 > 0.9
     assert hits[False] / 300 < 0.85  # as if there were three times as many choices
+
+
+def test_a_figure_draws_removed_sensors_in_common(drbpn: Path, tmp_path: Path) -> None:
+    """Runs whose n-th episodes have equal returns are worth no more than one of them."""
+    point = "'reduction:0.5:random',none:0"
+    rows = evaluate(tmp_path / "out.csv", drbpn, points=point, modes=["sampled"], episodes=20)
+    for i, row in enumerate(rows):
+        row["return"] = str(float(i % 7))
+
+    def width(table: list[dict[str, str]]) -> float:
+        (figure,) = draw_robustness(read_rows(table)).values()
+        (band,) = figure.axes[0].collections
+        ends = band.get_paths()[0].vertices
+        at = ends[ends[:, 0] == ends[:, 0].max()][:, 1]
+        return float(at.max() - at.min())
+
+    thrice = [row | {"run": f"run{i}"} for i in range(3) for row in rows]
+    assert width(thrice) == pytest.approx(width(rows), rel=0.15)
 
 
 def test_a_figure_has_a_panel_a_family_and_both_ratios(drbpn: Path, tmp_path: Path) -> None:

@@ -169,14 +169,21 @@ def leave_standing(root: TensorDictBase, running: Tensor) -> TensorDictBase:
     root.set("is_init", root.get("is_init") | ~running)
     carried = root.get("recurrent", None)
     if carried is not None:
-        rows = running.squeeze(-1)
-
-        def kept(value: Tensor) -> Tensor:
-            over = rows.reshape(-1, *(1,) * (value.ndim - 1))
-            return torch.where(over, value, torch.zeros_like(value))
-
-        root.set("recurrent", carried.apply(kept))
+        root.set("recurrent", carried.apply(lambda value: only_rows(running, value)))
     return root
+
+
+def only_rows(rows: Tensor, value: Tensor) -> Tensor:
+    """Put zeros into the other rows.
+
+    Args:
+        rows: bool of shape ``(episodes, 1)``.
+        value: shape ``(episodes, ...)``.
+
+    Returns:
+        Shape and dtype of ``value``.
+    """
+    return torch.where(rows.reshape(-1, *(1,) * (value.ndim - 1)), value, torch.zeros_like(value))
 
 
 def _first_episodes(

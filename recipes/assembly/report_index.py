@@ -23,9 +23,9 @@ from assembly.report_runs import trained_on
 _HEAD = """# Results
 
 One folder a study, each made by one command from the run folders beside it; its notes say what is
-missing or was added. Its
-`README.md` holds the tables, the commands from nothing to the page, and the versions; the CSV files
-beside it hold every seed's own numbers and what the figures were drawn from.
+missing or was added. Its `README.md` holds the tables, the commands from nothing to the page, and
+the versions; the CSV files beside it hold every seed's own numbers and what the figures were drawn
+from.
 
 This page, and every table below it, byte for byte from the run folders in `<study>/runs`:
 

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from assembly.agent import Agent
+from assembly.evaluation import only_rows
 
 # Of features. Observations are normalised: a million deviations from all that was ever seen is no
 # belief any more, and on its way to infinity.
@@ -61,11 +62,10 @@ class StoppingPolicy(TensorDictModuleBase):
         if any_stopped:
             # The row starts from zeros again, so that what reads it need not bear NaN.
             for key, value in numbers.items():
-                tensordict.set(key, torch.where(_over(stopped, value), 0, value))
+                tensordict.set(key, only_rows(~stopped, value))
         tensordict = self.actor(tensordict)
         if any_stopped:
-            action = tensordict.get("action")
-            tensordict.set("action", torch.where(_over(stopped, action), 0, action))
+            tensordict.set("action", only_rows(~stopped, tensordict.get("action")))
         return tensordict.set("diverged", stopped)
 
 
@@ -80,7 +80,3 @@ def _unchecked(belief: nn.Module) -> Iterator[None]:
     finally:
         for part in checking:
             part.validate = True
-
-
-def _over(rows: Tensor, value: Tensor) -> Tensor:
-    return rows.reshape(-1, *(1,) * (value.ndim - 1))

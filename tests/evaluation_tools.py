@@ -1,0 +1,50 @@
+"""What the tests of evaluate.py share: short runs to evaluate, and the command as it is called."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("hydra")
+from recipe_tools import ROOT, make_config  # isort: skip
+
+sys.path.insert(0, str(ROOT / "recipes"))
+import evaluate as recipe
+import torch
+from assembly.run import run as train
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+SMOKE = (
+    "experiment=smoke",
+    "missingness=mcar",
+    "missingness.eta=0.2",
+    "total_frames=128",
+    "evaluation.every_frames=0",
+    "evaluation.final_episodes=0",
+)
+
+
+def trained_folder(folder: Path, *overrides: str) -> Path:
+    with torch.random.fork_rng(devices=[]):
+        assert train(make_config(*SMOKE, *overrides), folder) == 0
+    return folder
+
+
+def configured(*overrides: str) -> dict[str, Any]:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        composed = OmegaConf.to_container(compose("evaluate", list(overrides)), resolve=True)
+    assert isinstance(composed, dict)
+    return {str(key): value for key, value in composed.items()}
+
+
+def evaluate(table: Path, *runs: Path, points: str = "", **options: Any) -> list[dict[str, str]]:
+    base = configured(*([f"points=[{points}]"] if points else []))
+    base |= {"run": [str(r) for r in runs], "output": str(table), "processes": 1, "episodes": 2}
+    assert recipe.run(base | {"figures": False} | options) == 0
+    with table.open(newline="") as file:
+        return list(csv.DictReader(file))

@@ -1,0 +1,201 @@
+"""Beliefs that leave the range of their numbers, under test: what they stop, and what not.
+
+Such a belief stops its own robot and no other; the belief of an episode that is over goes no
+further; every command answers the filter's error with a line; a report tells how many there were.
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
+from evaluation_tools import SMOKE, evaluate, trained_folder  # isort: skip
+
+import diagnose as diagnose_recipe
+from assembly import evaluation_grid
+from assembly.console import run_or_explain
+from assembly.diagnosis import diagnose
+from assembly.errors import UserError
+from assembly.evaluation_grid import agent_of, evaluate_tasks
+from assembly.points import parse_point
+from assembly.run_folder import write_table
+from assembly.settings import Settings, read_settings
+from assembly.trained import TrainedAgent, load_trained_agent
+from recipe_tools import make_config
+from report_tools import make_run, report
+
+from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
+
+
+@pytest.fixture(scope="module")
+def drbpn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained_folder(tmp_path_factory.mktemp("runs") / "drbpn")
+
+
+@pytest.fixture(scope="module")
+def settings() -> Settings:
+    return read_settings(make_config(*SMOKE))
+
+
+def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
+    usual = {
+        "run": str(folder), "out": out, "redraw": None, "episodes": 2, "mode": "sampled", "seed": 4,
+        "bins": [1, 2, 3, 6], "spike_std": 5.0, "reduction_seed": 0, "resamples": 50, "threads": 1,
+    }  # fmt: skip
+    return diagnose_recipe.run(usual | changes)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
+def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
+    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, value: float
+) -> None:
+    point = parse_point("mcar:0.5", settings, spike_std=5.0)
+    protocol = evaluation_grid.Protocol(3, ["sampled"], 1, 5.0, 0, 1)
+    ((_, _, expected),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+    step, calls, actions = BeliefFilter.step, [], []
+
+    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+        out = step(self, *args, **options)
+        calls.append(len(calls))
+        if len(calls) == 3:  # the second robot's belief, at its third step
+            out.mean[1] = value
+        return out
+
+    def look(env: GymnasiumBatchEnv, *arrays: Any) -> None:
+        actions.append(arrays[1].copy())
+        advance(env, *arrays)
+
+    advance = GymnasiumBatchEnv._advance
+    monkeypatch.setattr(BeliefFilter, "step", diverge)
+    monkeypatch.setattr(GymnasiumBatchEnv, "_advance", look)
+    ((_, _, found),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+    assert [row["diverged"] for row in found] == [0, 1, 0]
+    assert found[1]["log_likelihood"] is None
+    assert np.isfinite([row["return"] for row in found]).all()
+    for row in (0, 2):
+        assert found[row] == expected[row]
+    assert found[1]["return"] != expected[1]["return"]
+    stopped = np.stack(actions)[2 : found[1]["length"], 1]
+    assert len(stopped) > 0
+    assert (stopped == 0).all()
+    assert (np.stack(actions)[:2, 1] != 0).all()
+    assert agent_of(drbpn).agent.belief.filter.validate  # who asks by himself is told
+
+
+@pytest.mark.parametrize("command", ["evaluate", "diagnose"])
+def test_the_belief_of_an_episode_that_is_over_goes_no_further(
+    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """Fed its last observation for ever it may diverge, and stop an evaluation of others."""
+    step, means, resets = BeliefFilter.step, [], []
+
+    def look(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+        means.append(args[0].clone())
+        resets.append(args[5].clone())
+        return step(self, *args, **options)
+
+    monkeypatch.setattr(BeliefFilter, "step", look)
+    point = parse_point("mcar:0.5", settings, spike_std=5.0)
+    if command == "evaluate":
+        protocol = evaluation_grid.Protocol(4, ["sampled"], 1, 5.0, 0, 1)
+        ((_, _, rows),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+        lengths = [row["length"] for row in rows]
+    else:
+        tally = diagnose(
+            load_trained_agent(drbpn), point.missingness, episodes=4, mode="sampled", seed=1,
+            bins=[1, 2],
+        )  # fmt: skip
+        lengths = tally.lengths.int().tolist()
+    assert len(set(lengths)) > 1
+    assert len(means) == max(lengths)
+    for row, length in enumerate(lengths):
+        reset = torch.stack(resets)[:, row]
+        assert reset[0]
+        assert not reset[1:length].any()
+        assert reset[length:].all()
+        assert (torch.stack(means)[length:, row] == 0).all()
+
+
+def test_the_next_evaluation_begins_with_every_robot(
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, left = BeliefFilter.step, [1]
+
+    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+        out = step(self, *args, **options)
+        if left:
+            left.pop()
+            out.mean[:] = torch.inf
+        return out
+
+    monkeypatch.setattr(BeliefFilter, "step", diverge)
+    rows = evaluate(tmp_path / "out.csv", drbpn, points="none:0")
+    shares = {m: {row["diverged"] for row in rows if row["mode"] == m} for m in ("sampled", "mean")}
+    assert shares == {"sampled": {"1"}, "mean": {"0"}}
+
+
+def test_tables_without_room_for_stopped_episodes_are_gone_on_with(
+    drbpn: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.csv"
+    rows = evaluate(out, drbpn, points="none:0")
+    write_table(out, [{k: v for k, v in row.items() if k != "diverged"} for row in rows])
+    again = evaluate(out, drbpn, points="none:0,'mcar:0.5'")
+    assert again[: len(rows)] == rows
+    assert {row["diverged"] for row in again} == {"0"}
+
+
+def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
+    drbpn: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    whole = diagnose_recipe.diagnose
+
+    def diverging(trained: TrainedAgent, missingness: Any, **how: Any) -> Any:
+        if missingness.eta == 0.8:
+            raise BeliefDivergedError("the belief is no longer finite")
+        return whole(trained, missingness, **how)
+
+    monkeypatch.setattr(diagnose_recipe, "diagnose", diverging)
+    assert run_diagnosis(drbpn, tmp_path, points=["mcar:0.8", "mcar:0.4"]) == 0
+    assert "drbpn, mcar:0.8: no rows, the belief is no longer finite" in capsys.readouterr().out
+    with (tmp_path / "precision.csv").open(newline="") as file:
+        assert {row["point"] for row in csv.DictReader(file)} == {"mcar:0.4"}
+    with pytest.raises(UserError, match="no point is left: every belief diverged"):
+        run_diagnosis(drbpn, tmp_path, points=["mcar:0.8"])
+
+
+def test_an_error_of_the_filter_is_one_line_of_every_command(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def job() -> int:
+        raise BeliefDivergedError("the belief is no longer finite")
+
+    assert run_or_explain(job) == 2
+    assert capsys.readouterr().err == "error: the belief is no longer finite\n"
+
+
+def test_a_report_tells_in_how_many_episodes_a_belief_diverged(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        folder = make_run(tmp_path / f"drbpn-s{seed}", seed=seed)
+        with (folder / "points.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        for row in rows:
+            hit = seed == 1 and row["mechanism"] == "mcar" and row["episode"] == "0"
+            row["diverged"] = str(int(hit))
+        write_table(folder / "points.csv", rows)
+    report(str(tmp_path / "drbpn-*"), tmp_path / "out")
+    page = (tmp_path / "out" / "README.md").read_text()
+    (line,) = [line for line in page.splitlines() if line.startswith("| mcar:0.5 |")]
+    assert line.endswith("85 % (diverged: 25 %) |")  # one of four
+    (clean,) = [x for x in page.splitlines() if x.startswith("| none:0 |") and "[" in x]
+    assert "diverged" not in clean
