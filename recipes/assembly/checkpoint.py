@@ -58,7 +58,7 @@ def last_checkpoint(folder: Path) -> Path:
     if not found:
         raise UserError(
             f"`{folder}` holds no checkpoint: it is not a run folder, or the run ended before "
-            "its first one. Start it anew."
+            "its first one, or none was kept. Start it anew."
         )
     return found[-1]
 
