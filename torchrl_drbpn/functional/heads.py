@@ -1,0 +1,222 @@
+"""PPO's terms of two small networks in C: one call forward and one back.
+
+On a minibatch of some hundred frames a policy head, a value head, the clipped gain and the value
+error are some fifty operations of PyTorch and as many nodes of its graph, each of which costs more
+than its arithmetic. ``heads.c`` computes the same; where the C code cannot be had, PyTorch does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from torchrl_drbpn.functional.compiled import load_library, native_error
+
+__all__ = ["ClippedTerms", "clipped_heads", "heads_refusal"]
+
+_CPU = torch.device("cpu")
+_MAX_LAYERS = 8
+_KINDS = ("l2", "l1", "smooth_l1")
+
+
+class ClippedTerms(NamedTuple):
+    """What PPO's loss reports; only the first two have a gradient.
+
+    Attributes:
+        objective: minus the mean clipped gain.
+        error: mean distance of the value from its target.
+        clip_fraction: share of frames whose ratio was clipped.
+        kl: mean of minus the log ratio, nats.
+        max_ratio: the largest ratio of the policy to the one that collected.
+        mean_ratio: their mean.
+        sample_size: effective sample size over the first dimension, as a share of it.
+    """
+
+    objective: Tensor
+    error: Tensor
+    clip_fraction: Tensor
+    kl: Tensor
+    max_ratio: Tensor
+    mean_ratio: Tensor
+    sample_size: Tensor
+
+
+def heads_refusal(actor: Sequence[Tensor], critic: Sequence[Tensor], *given: Tensor) -> str | None:
+    """Say why the C code does not take these networks and numbers.
+
+    Args:
+        actor: weight and bias of every layer of the policy's network.
+        critic: the same of the value's.
+        given: every other tensor of :func:`clipped_heads`.
+
+    Returns:
+        None where it takes them, else the reason.
+
+    Example:
+        >>> import torch
+        >>> heads_refusal([torch.zeros(1, 2), torch.zeros(1)], [torch.zeros(1, 2).double()])
+        'the dtypes differ'
+    """
+    every = [*actor, *critic, *given]
+    dtype = every[0].dtype
+    if torch.compiler.is_compiling():
+        return "torch.compile traces PyTorch's operations"
+    if torch._C._are_functorch_transforms_active():
+        return "torch.func transforms PyTorch's operations"
+    if torch.is_autocast_enabled("cpu"):
+        return "autocast computes in another dtype"
+    if any(value.device != _CPU for value in every):
+        return "it runs on the CPU"
+    if any(value.dtype != dtype for value in every):
+        return "the dtypes differ"
+    if not all(value.is_contiguous() for value in every):
+        return "memory is not contiguous"
+    if max(len(actor), len(critic)) > 2 * _MAX_LAYERS:
+        return f"a network has more than {_MAX_LAYERS} layers"
+    return _error(dtype)
+
+
+def clipped_heads(
+    features: Tensor,
+    action: Tensor,
+    old_log_prob: Tensor,
+    advantage: Tensor,
+    value_target: Tensor,
+    log_scale: Tensor,
+    actor: Sequence[Tensor],
+    critic: Sequence[Tensor],
+    *,
+    low: float,
+    high: float,
+    scale_floor: float,
+    kind: Literal["l2", "l1", "smooth_l1"],
+) -> ClippedTerms:
+    r"""Run policy and value on features; return the clipped objective and the value's error.
+
+    .. math::
+        L = -\frac{1}{n} \sum \min(w A, \mathrm{clip}(w, 1 - \epsilon, 1 + \epsilon) A), \quad
+        w = N(a; \mu, \sigma) / N_{old}, \quad E = \frac{1}{n} \sum d(v, V)
+
+    Eq. (7) of [Schulman et al. 2017]; mu and v are networks of tanh layers, sigma is independent
+    of the features. Differentiable once, by features, log scale and the networks.
+
+    Args:
+        features: shape ``(*batch, features)``.
+        action: shape ``(*batch, action)``.
+        old_log_prob: of the policy that collected, shape ``(*batch,)``.
+        advantage: shape ``(*batch,)``.
+        value_target: shape ``(*batch,)``.
+        log_scale: log sigma, shape ``(action,)``.
+        actor: weight and bias of every layer of mu, tanh between them.
+        critic: the same of v.
+
+    Keyword Args:
+        low: log(1 - epsilon).
+        high: log(1 + epsilon).
+        scale_floor: least sigma; below it the log scale has no gradient.
+        kind: the distance d: squared, absolute, or absolute from 1 on and half the square below.
+
+    Returns:
+        The terms; call it where :func:`heads_refusal` is None.
+
+    Example:
+        >>> import torch
+        >>> actor, critic = ([torch.zeros(n, 3), torch.zeros(n)] for n in (2, 1))
+        >>> given = [torch.randn(4, 3), torch.zeros(4, 2), torch.zeros(4), torch.ones(4),
+        ...          torch.full((4,), 3.0), torch.zeros(2)]
+        >>> found = heads_refusal(actor, critic, *given) is not None or clipped_heads(
+        ...     *given, actor, critic, low=-0.2, high=0.2, scale_floor=1e-4, kind="l1").error
+        >>> float(found) in (1.0, 3.0)  # 1: no compiler here
+        True
+    """
+    settings = (low, high, scale_floor, _KINDS.index(kind), len(actor))
+    out = _ClippedHeads.apply(  # type: ignore[no-untyped-call]
+        settings, features, action, old_log_prob, advantage, value_target, log_scale, *actor,
+        *critic,
+    )  # fmt: skip
+    objective, error, metrics, sample_size = out
+    clip_fraction, kl, max_ratio, mean_ratio = metrics.unbind()
+    return ClippedTerms(objective, error, clip_fraction, kl, max_ratio, mean_ratio, sample_size)
+
+
+class _ClippedHeads(torch.autograd.Function):
+    """Call ``heads.c``; inputs as of :func:`clipped_heads`, all contiguous, of one dtype."""
+
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return objective, error, four metrics, and effective sample sizes."""
+        (low, high, floor, kind, of_actor), *given = args
+        features, old_log_prob, layers = given[0], given[2], given[6:]
+        widths = [weight.shape[0] for weight in layers[0::2]]
+        rows, columns = old_log_prob.numel(), old_log_prob[:1].numel()
+        numbers = [
+            rows, columns, given[1].shape[-1], kind, features.shape[-1], of_actor // 2,
+            (len(layers) - of_actor) // 2, *widths,
+        ]  # fmt: skip
+        dims = (ctypes.c_int64 * len(numbers))(*numbers)
+        native = _load(features.dtype)
+        counts = (ctypes.c_int64 * 2)()
+        native.sizes(dims, counts)
+        tape, scratch = (features.new_empty(count) for count in counts)
+        objective, error = features.new_empty(()), features.new_empty(())
+        metrics, sample_size = features.new_empty(4), features.new_empty(old_log_prob.shape[1:])
+        native.forward(
+            dims,
+            (ctypes.c_double * 3)(low, high, floor),
+            _pointers(*given[:6], objective, error, metrics, sample_size, tape, scratch, *layers),
+        )
+        ctx.save_for_backward(tape, *layers)
+        ctx.dims, ctx.scratch, ctx.shapes = dims, counts[1], (features.shape, given[5].shape)
+        ctx.mark_non_differentiable(metrics, sample_size)
+        ctx.set_materialize_grads(False)
+        return objective, error, metrics, sample_size
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, by_objective: Tensor | None, by_error: Tensor | None, *_: Any
+    ) -> tuple[Tensor | None, ...]:
+        """Return the gradients by features, log scale and layers."""
+        tape, *layers = ctx.saved_tensors
+        of_features = tape.new_empty(ctx.shapes[0]) if ctx.needs_input_grad[1] else None
+        of_scale = tape.new_empty(ctx.shapes[1])
+        of_layers = [torch.empty_like(value) for value in layers]
+        scratch = tape.new_empty(ctx.scratch)
+        _load(tape.dtype).backward(
+            ctx.dims,
+            _pointers(
+                by_objective, by_error, tape, scratch, of_features, of_scale, *layers, *of_layers
+            ),
+        )
+        return (None, of_features, None, None, None, None, of_scale, *of_layers)
+
+
+def _pointers(*tensors: Tensor | None) -> ctypes.Array[ctypes.c_void_p]:
+    at = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
+    return (ctypes.c_void_p * len(at))(*at)
+
+
+class _Functions(NamedTuple):
+    sizes: ctypes._NamedFuncPointer
+    forward: ctypes._NamedFuncPointer
+    backward: ctypes._NamedFuncPointer
+
+
+@functools.cache
+def _error(dtype: torch.dtype) -> str | None:
+    return native_error(dtype, "heads")
+
+
+@functools.cache
+def _load(dtype: torch.dtype) -> _Functions:
+    library = load_library(dtype, "heads")
+    out = _Functions(library.heads_sizes, library.heads_forward, library.heads_backward)
+    for function in out:
+        function.restype = None
+    return out
