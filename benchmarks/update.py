@@ -25,7 +25,7 @@ from recipe import (
 from tensordict import TensorDictBase
 from timing import CLOCKS, finish, interleave, parser, start, table
 
-from torchrl_drbpn.functional import FilterOutput
+from torchrl_drbpn.functional import FilterOutput, FollowedOutput
 
 PARTS = (
     "filter",
@@ -62,7 +62,8 @@ class Update:
 
     def _leave(self, _module: Any, _inputs: Any, out: Any) -> None:
         self._in_filter += self.clock() - self._entered
-        features = out.mean if isinstance(out, FilterOutput) else out.get("features")
+        plain = isinstance(out, (FilterOutput, FollowedOutput))
+        features = out.mean if plain else out.get("features")
         whole = features.shape[:2] == self.batch.shape  # not the pass over the last observations
         if whole and features.requires_grad:
             # The engine computes this gradient when it has passed loss and heads.

@@ -27,6 +27,8 @@ from torchrl_drbpn.functional.corruption import (
 )
 from torchrl_drbpn.functional.filtering import (
     FilterOutput,
+    FollowedOutput,
+    filter_followed,
     filter_sequence,
     filter_step,
     filtered_cov,
@@ -42,7 +44,7 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
-from torchrl_drbpn.functional.model import StateSpace, choose_form, predict_step
+from torchrl_drbpn.functional.model import Following, StateSpace, choose_form, predict_step
 from torchrl_drbpn.functional.particles import (
     DiagonalGaussian,
     Outcome,
@@ -66,6 +68,8 @@ __all__ = [
     "Consistency",
     "DiagonalGaussian",
     "FilterOutput",
+    "FollowedOutput",
+    "Following",
     "MeanNetwork",
     "MissingnessMechanism",
     "OutageRates",
@@ -84,6 +88,7 @@ __all__ = [
     "diagonal_log_density",
     "draw_mechanism",
     "effective_sample_size",
+    "filter_followed",
     "filter_sequence",
     "filter_step",
     "filtered_cov",

@@ -18,6 +18,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_drbpn.functional.forms import (
+    gain_precision,
+    information_likelihood,
+    run_information,
+    run_innovation,
+    run_loop,
+    run_native,
+)
 from torchrl_drbpn.functional.gaussian import (
     LOG_2PI,
     check_observed,
@@ -26,23 +34,25 @@ from torchrl_drbpn.functional.gaussian import (
 )
 from torchrl_drbpn.functional.kalman import log_likelihood, update
 from torchrl_drbpn.functional.model import (
+    Following,
     Form,
     StateSpace,
     checked_form,
-    choose_form,
     constant_cov,
     initial_belief,
     predict_step,
 )
-from torchrl_drbpn.functional.native import NativeRecurrence, native_refusal
+from torchrl_drbpn.functional.native import native_refusal
 from torchrl_drbpn.functional.precision import outside_autocast
-from torchrl_drbpn.functional.recurrence import (
-    InformationRecurrence,
-    InnovationRecurrence,
-    MeanNetwork,
-)
 
-__all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
+__all__ = [
+    "FilterOutput",
+    "FollowedOutput",
+    "filter_followed",
+    "filter_sequence",
+    "filter_step",
+    "filtered_cov",
+]
 
 
 class FilterOutput(NamedTuple):
@@ -64,6 +74,28 @@ class FilterOutput(NamedTuple):
     mean: Tensor
     cov: Tensor | None
     log_likelihood: Tensor
+
+
+class FollowedOutput(NamedTuple):
+    """Hold what the filter returns where observations follow.
+
+    Args:
+        mean: as in :class:`FilterOutput`.
+        cov: as there.
+        log_likelihood: as there.
+        following_log_likelihood: of the observations that follow, shape ``(count,)``, nats.
+
+    Example:
+        >>> import torch
+        >>> out = FollowedOutput(torch.zeros(2), None, torch.zeros(()), torch.zeros(3))
+        >>> len(out.following_log_likelihood)
+        3
+    """
+
+    mean: Tensor
+    cov: Tensor | None
+    log_likelihood: Tensor
+    following_log_likelihood: Tensor
 
 
 @outside_autocast
@@ -119,7 +151,7 @@ def filter_step(
     ):
         x, seen = observation.unsqueeze(reset.ndim), observed.unsqueeze(reset.ndim)
         action, start = previous_action.unsqueeze(reset.ndim), reset.unsqueeze(-1)
-        m, ll = _native(model, mean, action, x, seen, start, None, None)
+        m, ll, _ = run_native(model, mean, action, x, seen, start, None, None)
         cov = filtered_cov(model, observed, reset) if return_cov else None
         return FilterOutput(m.squeeze(-2), cov, ll.squeeze(-1))
     predicted = predict_step(model, mean, previous_action, reset)
@@ -139,12 +171,12 @@ def filter_step(
         wide = model.double()
         residual = residual.double()
         weight = observed / wide.emission_cov
-        precision, log_det_prior = _precision(wide, weight, row)
+        precision, log_det_prior = gain_precision(wide, weight, row)
         factor = torch.linalg.cholesky(precision)
         pull = (weight * residual) @ wide.emission_matrix
         step = torch.cholesky_solve(pull.unsqueeze(-1), factor).squeeze(-1)
         log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + log_det_prior
-        ll = _information_likelihood(wide, step, residual, weight, observed, log_det, row)
+        ll = information_likelihood(wide, step, residual, weight, observed, log_det, row)
         step, ll = step.to(m.dtype), ll.to(m.dtype)
     else:
         wide = model.double()
@@ -199,7 +231,6 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
     return update(prior, nothing, observed, H, R).cov
 
 
-@outside_autocast
 def filter_sequence(
     model: StateSpace,
     mean: Tensor,
@@ -253,6 +284,100 @@ def filter_sequence(
         >>> out.mean.shape, out.log_likelihood.shape
         (torch.Size([4, 10, 2]), torch.Size([4, 10]))
     """
+    out, _ = _filter(
+        model, mean, previous_action, observation, observed, reset, restart, restart_mean, None,
+        return_cov, form,
+    )  # fmt: skip
+    return out
+
+
+def filter_followed(
+    model: StateSpace,
+    mean: Tensor,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    following: Following,
+    *,
+    restart: Tensor | None = None,
+    restart_mean: Tensor | None = None,
+    return_cov: bool = False,
+    form: Form = "auto",
+) -> FollowedOutput:
+    """Filter sequences, and evaluate observations that follow some of their steps.
+
+    The same as :func:`filter_sequence`, and then one more step from the filtered means that
+    ``following`` names, in one pass where the C form runs.
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
+        previous_action: shape ``(*batch, time, action)``.
+        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, time, obs)``.
+        reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
+        following: observations that come after some of the steps and are no steps themselves.
+
+    Keyword Args:
+        restart: see :func:`filter_sequence`.
+        restart_mean: see there.
+        return_cov: see there.
+        form: see there.
+
+    Returns:
+        :class:`FollowedOutput`.
+
+    Raises:
+        ValueError: as :func:`filter_sequence`.
+
+    Example:
+        >>> import torch
+        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...                    torch.zeros(2), eye)
+        >>> seen = torch.rand(4, 10, 2) < 0.7
+        >>> last = Following(
+        ...     torch.tensor([9, 39]), torch.zeros(2, 1), torch.randn(2, 2), seen[0, :2])
+        >>> out = filter_followed(model, torch.zeros(4, 2), torch.zeros(4, 10, 1),
+        ...                       torch.randn(4, 10, 2), seen, torch.zeros(4, 10, dtype=torch.bool),
+        ...                       last)
+        >>> out.following_log_likelihood.shape
+        torch.Size([2])
+    """
+    out, after = _filter(
+        model, mean, previous_action, observation, observed, reset, restart, restart_mean,
+        following, return_cov, form,
+    )  # fmt: skip
+    if after is None:  # it is no part of a longer pass: sequences of one step that go on
+        before = out.mean.reshape(-1, out.mean.shape[-1]).index_select(0, following.step)
+        action, x, seen = (value.unsqueeze(1) for value in following[1:])
+        goes_on = seen.new_zeros(len(before), 1)
+        after = out.log_likelihood.new_zeros(0)
+        if len(before):
+            last, _ = _filter(
+                model, before, action, x, seen, goes_on, None, None, None, False, form
+            )
+            after = last.log_likelihood.squeeze(1)
+    return FollowedOutput(*out, after)
+
+
+@outside_autocast
+def _filter(
+    model: StateSpace,
+    mean: Tensor,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    restart: Tensor | None,
+    restart_mean: Tensor | None,
+    following: Following | None,
+    return_cov: bool,
+    form: Form,
+) -> tuple[FilterOutput, Tensor | None]:
+    """Run the chosen form; what follows is evaluated where it can go along, else None."""
     chosen = checked_form(model, form)
     check_observed(observation, observed)
     if (restart is None) != (restart_mean is None):
@@ -266,12 +391,13 @@ def filter_sequence(
     if chosen == "native" or (chosen != "loop" and form == "auto"):
         refusal = native_refusal(model, mean, previous_action, observation, restart_mean)
         if refusal is None:
-            filtered, ll = _native(
-                model, mean, previous_action, observation, observed, reset, restart, restart_mean
-            )
-            return FilterOutput(
-                filtered, filtered_cov(model, observed, reset) if return_cov else None, ll
-            )
+            joined = following if _goes_along(following, observation) else None
+            filtered, ll, after = run_native(
+                model, mean, previous_action, observation, observed, reset, restart, restart_mean,
+                joined,
+            )  # fmt: skip
+            cov = filtered_cov(model, observed, reset) if return_cov else None
+            return FilterOutput(filtered, cov, ll), after
         if chosen == "native":
             raise ValueError(f"`form` 'native' cannot run here: {refusal}. Use form='auto'.")
 
@@ -291,185 +417,27 @@ def filter_sequence(
     stored = None if restart_mean is None else time_major(restart_mean)
     start = mean.reshape(-1, mean.shape[-1])
 
+    covs: Tensor | None
     if chosen == "loop":
-        filtered, cov, ll = _loop(model, start, a, x, seen, first, again, stored)
-        return FilterOutput(
-            batch_major(filtered), batch_major(cov) if return_cov else None, batch_major(ll)
+        filtered, covs, ll = run_loop(model, start, a, x, seen, first, again, stored)
+        covs = batch_major(covs) if return_cov else None
+    else:
+        run = run_innovation if chosen == "innovation" else run_information
+        filtered, ll = run(model, start, a, x, seen, first, again, stored)
+        ll = torch.where(seen.any(-1), ll, 0.0)
+        covs = filtered_cov(model, observed, reset) if return_cov else None
+    return FilterOutput(batch_major(filtered), covs, batch_major(ll)), None
+
+
+def _goes_along(following: Following | None, observation: Tensor) -> bool:
+    """Tell whether the C form takes it in the same call: no gradient reaches it there."""
+    return (
+        following is not None
+        and len(following.step) > 0
+        and all(
+            value.dtype == observation.dtype
+            and value.device == observation.device
+            and not value.requires_grad
+            for value in (following.observation, following.previous_action)
         )
-    run = _innovation if chosen == "innovation" else _information
-    filtered, ll = run(model, start, a, x, seen, first, again, stored)
-    ll = torch.where(seen.any(-1), ll, 0.0)
-    covs = filtered_cov(model, observed, reset) if return_cov else None
-    return FilterOutput(batch_major(filtered), covs, batch_major(ll))
-
-
-def _loop(
-    model: StateSpace,
-    mean: Tensor,
-    action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    restart: Tensor | None,
-    stored: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Run :mod:`.kalman` step by step, time-major; any transition, any covariance."""
-    H, R = model.emission_matrix, model.full_emission_cov()
-    offset = model.offset(action)
-    means, covs, lls = [], [], []
-    for t in range(len(action)):
-        if restart is not None and stored is not None:
-            mean = torch.where(restart[t], stored[t], mean)
-        predicted = predict_step(model, mean, action[t], reset[t].squeeze(-1))
-        filtered = update(predicted, observation[t], observed[t], H, R, offset[t])
-        lls.append(log_likelihood(predicted, observation[t], observed[t], H, R, offset[t]))
-        mean = filtered.mean
-        means.append(mean)
-        covs.append(filtered.cov)
-    return torch.stack(means), torch.stack(covs), torch.stack(lls)
-
-
-def _native(
-    model: StateSpace,
-    start: Tensor,
-    action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    restart: Tensor | None,
-    stored: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    f, dtype, (*batch, time) = model.transition, start.dtype, reset.shape
-    assert isinstance(f, MeanNetwork)  # choose_form saw to it; for the type checker
-    state = model.emission_matrix.shape[-1]
-    information = choose_form(model) == "information"
-    covs = constant_cov(model), model.initial_cov
-    if information:
-        prior, log_det = _prior_precision(model.double())
-        covs = prior[0], prior[1]
-
-    def rows(x: Tensor | None) -> Tensor | None:
-        return None if x is None else x.reshape(-1, *x.shape[len(batch) :]).contiguous()
-
-    start = start.reshape(-1, state)
-    parameters = (
-        *covs, model.emission_cov, model.emission_matrix, model.action_matrix,
-        model.emission_offset, model.initial_mean,
-        *(p for pair in zip(f.weights, f.biases, strict=True) for p in pair),
-    )  # fmt: skip
-    mean, ll = NativeRecurrence.apply(  # type: ignore[no-untyped-call]
-        information, f.residual, f.activation,
-        *map(rows, (observation, observed, action, reset, restart, stored)),
-        start if start.stride(-1) == 1 else start.contiguous(),
-        *(x.contiguous() for x in parameters),
-    )  # fmt: skip
-    ll = ll.view(*batch, time)
-    if information:
-        ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
-        ll = torch.where(observed.any(-1), ll, 0.0)
-    return mean.view(*batch, time, state), ll.to(dtype)
-
-
-def _network(model: StateSpace, action: Tensor) -> tuple[MeanNetwork, Tensor, list[Tensor]]:
-    """Split the first layer: its action part for all steps at once, its weights on the mean."""
-    f = model.transition
-    assert isinstance(f, MeanNetwork)  # choose_form saw to it; for the type checker
-    state = model.emission_matrix.shape[-1]
-    drive = torch.nn.functional.linear(action, f.weights[0][:, state:], f.biases[0])
-    rest = [p for pair in zip(f.weights[1:], f.biases[1:], strict=True) for p in pair]
-    return f, drive, [f.weights[0][:, :state], *rest]
-
-
-def _innovation(
-    model: StateSpace,
-    start: Tensor,
-    action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    restart: Tensor | None,
-    stored: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    f, drive, weights = _network(model, action)
-    wide = model.double()  # see InnovationRecurrence
-    H, Q, R = wide.emission_matrix, constant_cov(wide), wide.full_emission_cov()
-    cross, initial_cross = Q @ H.mT, wide.initial_cov @ H.mT
-    y = zero_missing(observation - model.offset(action), observed)
-    _, mean, ll = InnovationRecurrence.apply(  # type: ignore[no-untyped-call]
-        f.residual, f.activation, y, observed, reset, restart, stored, start, drive,
-        model.initial_mean, model.emission_matrix, H @ cross + R, H @ initial_cross + R, cross,
-        initial_cross, *weights,
-    )  # fmt: skip
-    return mean, ll - (0.5 * LOG_2PI) * observed.sum(-1).to(ll.dtype)
-
-
-def _precision(model: StateSpace, weight: Tensor, reset: Tensor) -> tuple[Tensor, Tensor]:
-    """Return inv(P) + sum_i w_i h_i h_i' and log|P|, P of the step (Q, or P_0 at a reset)."""
-    gathered = _gathered(model, weight)
-    prior, log_det = _prior_precision(model)
-    at_reset = reset.squeeze(-1)
-    both = torch.where(reset.unsqueeze(-1), prior[1], prior[0])
-    return gathered + both, torch.where(at_reset, log_det[1], log_det[0])
-
-
-def _prior_precision(model: StateSpace) -> tuple[Tensor, Tensor]:
-    """Return the inverses and log-determinants of (Q, P_0): two small matrices a call."""
-    factor = torch.linalg.cholesky(torch.stack([constant_cov(model), model.initial_cov]))
-    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return torch.cholesky_inverse(factor), log_det
-
-
-def _gathered(model: StateSpace, weight: Tensor) -> Tensor:
-    """Return N = sum_i w_i h_i h_i' for every step: one matrix product over all of them."""
-    H = model.emission_matrix
-    state = H.shape[-1]
-    outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
-    return (weight @ outer).view(*weight.shape[:-1], state, state)
-
-
-def _information_likelihood(
-    model: StateSpace,
-    step: Tensor,
-    residual: Tensor,
-    weight: Tensor,
-    observed: Tensor,
-    log_det: Tensor,
-    reset: Tensor,
-) -> Tensor:
-    r"""Evaluate eq. (12) [DRBPN] without an obs x obs matrix.
-
-    .. math::
-        v' S^{-1} v = (v - H \delta)' W (v - H \delta) + \delta' P^{-1} \delta, \qquad
-        \log|S| = \textstyle\sum_i m_i \log r_i + \log|P| + \log|P^{-1} + H' W H|
-
-    with :math:`\delta = m^+ - m^-` and W = diag(m / r). Both terms of the quadratic form are sums
-    of squares, so nothing cancels in float32 when R is small.
-    """
-    fit = residual - observed * (step @ model.emission_matrix.mT)
-    prior, _ = _prior_precision(model)
-    by_prior = torch.where(reset, step @ prior[1], step @ prior[0])
-    quadratic = (weight * fit.square()).sum(-1) + (step * by_prior).sum(-1)
-    log_noise = observed.to(step.dtype) @ (model.emission_cov.log() + LOG_2PI)
-    return -0.5 * (quadratic + log_noise + log_det)
-
-
-def _information(
-    model: StateSpace,
-    start: Tensor,
-    action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    restart: Tensor | None,
-    stored: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    f, drive, weights = _network(model, action)
-    y = zero_missing(observation - model.offset(action), observed)
-    wide = model.double()  # see InformationRecurrence
-    prior, log_det = _prior_precision(wide)
-    mean, ll = InformationRecurrence.apply(  # type: ignore[no-untyped-call]
-        f.residual, f.activation, y, observed, wide.emission_matrix, wide.emission_cov, prior[0],
-        prior[1], reset, restart, stored, start, drive, model.initial_mean, *weights,
-    )  # fmt: skip
-    ll = ll - 0.5 * torch.where(reset.squeeze(-1), log_det[1], log_det[0])
-    return mean, ll.to(mean.dtype)
+    )

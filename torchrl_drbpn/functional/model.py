@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl_drbpn.functional.gaussian import Belief
 from torchrl_drbpn.functional.recurrence import MeanNetwork
 
-__all__ = ["Form", "StateSpace", "choose_form", "constant_cov", "predict_step"]
+__all__ = ["Following", "Form", "StateSpace", "choose_form", "constant_cov", "predict_step"]
 
 Form = Literal["auto", "innovation", "information", "native", "loop"]
 
@@ -68,6 +68,32 @@ class StateSpace(NamedTuple):
     def offset(self, previous_action: Tensor) -> Tensor:
         """Return B a + d, shape ``(*batch, obs)``."""
         return torch.nn.functional.linear(previous_action, self.action_matrix, self.emission_offset)
+
+
+class Following(NamedTuple):
+    """Hold observations that come after some steps of a sequence and are no steps of it.
+
+    Where an episode ends, the next step of the sequence is another episode's first: the last
+    observation lies beside it. Its likelihood is that of a step which goes on from there.
+
+    Args:
+        step: int64, shape ``(count,)``, the steps before: places in ``(*batch, time)`` flattened.
+        previous_action: shape ``(count, action)``.
+        observation: shape ``(count, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(count, obs)``.
+
+    Example:
+        >>> import torch
+        >>> after = Following(torch.tensor([9]), torch.zeros(1, 1), torch.zeros(1, 2),
+        ...                   torch.ones(1, 2, dtype=torch.bool))
+        >>> len(after.step)
+        1
+    """
+
+    step: Tensor
+    previous_action: Tensor
+    observation: Tensor
+    observed: Tensor
 
 
 def choose_form(model: StateSpace) -> Literal["innovation", "information", "loop"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,8 +12,11 @@ from torch import Tensor, nn
 from torchrl_drbpn.functional import (
     Belief,
     FilterOutput,
+    FollowedOutput,
+    Following,
     MeanNetwork,
     StateSpace,
+    filter_followed,
     filter_sequence,
     filter_step,
     predict_step,
@@ -265,8 +269,9 @@ class BeliefFilter(nn.Module):
         *,
         restart: Tensor | None = None,
         restart_mean: Tensor | None = None,
+        following: Following | None = None,
         return_cov: bool = False,
-    ) -> FilterOutput:
+    ) -> FilterOutput | FollowedOutput:
         """Filter sequences, episode starts inside them included.
 
         Args:
@@ -281,10 +286,13 @@ class BeliefFilter(nn.Module):
             restart: bool, shape ``(*batch, time)``; True takes the belief of the step before
                 from ``restart_mean`` instead of from the sequence.
             restart_mean: shape ``(*batch, time, state)``.
+            following: observations that come after some of the steps and are no steps themselves,
+                whose likelihood is wanted.
             return_cov: whether the filtered covariances are wanted.
 
         Returns:
-            :class:`~torchrl_drbpn.functional.FilterOutput` with shapes ``(*batch, time, ...)``.
+            :class:`~torchrl_drbpn.functional.FilterOutput` with shapes ``(*batch, time, ...)``;
+            with ``following`` a :class:`~torchrl_drbpn.functional.FollowedOutput`.
 
         Raises:
             ValueError: for a shape, a dtype or an observed value that cannot be.
@@ -296,19 +304,21 @@ class BeliefFilter(nn.Module):
                 "`mean` must be the belief before the first step, of shape (*batch, state) = "
                 f"{(*reset.shape[:-1], self.state_dim)}, got {tuple(mean.shape)}."
             )
-        out = filter_sequence(
-            self.state_space(),
-            mean,
-            previous_action,
-            observation,
-            observed,
-            reset,
-            restart=restart,
-            restart_mean=restart_mean,
-            return_cov=return_cov,
-            form=self.form,
-        )
-        self._check_values(out, mean, previous_action, observation, observed)
+        if following is not None:
+            self._check_following(following, previous_action.dtype)
+        sequence = (mean, previous_action, observation, observed, reset)
+        how: dict[str, Any] = {
+            "restart": restart,
+            "restart_mean": restart_mean,
+            "return_cov": return_cov,
+            "form": self.form,
+        }
+        out: FilterOutput | FollowedOutput
+        if following is None:
+            out = filter_sequence(self.state_space(), *sequence, **how)
+        else:
+            out = filter_followed(self.state_space(), *sequence, following, **how)
+        self._check_values(out, mean, previous_action, observation, observed, following)
         return out
 
     def predict(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
@@ -361,23 +371,50 @@ class BeliefFilter(nn.Module):
                     "TorchRL's DoubleToFloat to the environment, or build the filter with dtype=."
                 )
 
+    def _check_following(self, following: Following, dtype: torch.dtype) -> None:
+        """Raise on shapes or dtypes of what follows that cannot be."""
+        step, action, x, observed = following
+        count = len(step) if step.ndim == 1 else -1
+        wanted = (
+            ("step", step, (count,), torch.int64),
+            ("previous_action", action, (count, self.action_dim), dtype),
+            ("observation", x, (count, self.obs_dim), dtype),
+            ("observed", observed, (count, self.obs_dim), torch.bool),
+        )
+        for name, value, shape, kind in wanted:
+            if value.shape != shape or value.dtype != kind:
+                raise ValueError(
+                    f"`following.{name}` must be {str(kind).removeprefix('torch.')} of shape "
+                    f"{shape if count >= 0 else '(count,)'}, got {_describe(value)}: one row for "
+                    "every place in (*batch, time) flattened after which an observation follows."
+                )
+
     def _check_values(
         self,
-        out: FilterOutput,
+        out: FilterOutput | FollowedOutput,
         mean: Tensor,
         previous_action: Tensor,
         observation: Tensor,
         observed: Tensor,
+        following: Following | None = None,
     ) -> None:
-        """Raise on a value that cannot be; two sums and one number on the host tell.
+        """Raise on a value that cannot be; a few sums and one number on the host tell.
 
         The mean is looked at too: where nothing was observed the likelihood is 0 whatever it is.
         """
         if not self.validate or torch.compiler.is_compiling():
             return
-        if bool(torch.isfinite(out.log_likelihood.sum() + out.mean.sum())):
+        total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
+        if isinstance(out, FollowedOutput):
+            total = total + out.following_log_likelihood.detach().sum()
+        if bool(torch.isfinite(total)):
             return
         bad = observed & ~torch.isfinite(observation)
+        actions = [previous_action]
+        if following is not None:
+            beside = following.observed & ~torch.isfinite(following.observation)
+            bad = torch.cat([bad.flatten(0, -2), beside])
+            actions.append(following.previous_action)
         if bool(bad.any()):
             components = bad.flatten(0, -2).any(0).nonzero().flatten().tolist()
             raise ValueError(
@@ -385,7 +422,7 @@ class BeliefFilter(nn.Module):
                 f"(components {components}): mark them missing, for example with "
                 "ObservedFromNaN."
             )
-        for name, value in (("previous_action", previous_action), ("mean", mean)):
+        for name, value in (*(("previous_action", action) for action in actions), ("mean", mean)):
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(
                     f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "

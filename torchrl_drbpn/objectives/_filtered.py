@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,6 +9,7 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_drbpn.functional import Following
 from torchrl_drbpn.modules import BeliefFilter, BeliefFilterModule
 from torchrl_drbpn.objectives.belief_model import BeliefModelLoss
 
@@ -57,39 +57,33 @@ def filtered_terms(
     if any(entry is None for entry in entries):
         return None
     observation, observed, action, is_init, mean, age = entries
-    belief = module.filter
     action = action.to(mean.dtype)
     first = is_init.squeeze(-1)
     reset = first & (age.squeeze(-1) == 0)
-    with nullcontext() if model_loss is None else belief.shared_state_space():
-        out = belief(
-            mean[..., 0, :], None, action, observation, observed, reset,
-            restart=first & ~reset, restart_mean=mean,
-        )  # fmt: skip
-        results = (out.mean, out.mean, out.log_likelihood, out.mean, age + 1)
-        written = dict(zip(module.out_keys, results, strict=True))
-        if model_loss is None:
-            return written, {}
-        keys = model_loss.tensor_keys
-        total, count = out.log_likelihood.sum(), observed.sum()
-        steps = reset.numel()
-        last = _last(data, keys.done, keys.final)
-        following = data.get(keys.next_observed, None)
-        if last is not None and following is not None and len(last):
+    following = None
+    if model_loss is not None:
+        last = _last(data, model_loss.tensor_keys.done, model_loss.tensor_keys.final)
+        next_observed = data.get(model_loss.tensor_keys.next_observed, None)
+        if last is not None and next_observed is not None and len(last):
             nexts = [data.get(unravel_key(("next", key)), None) for key in module.in_keys[:3]]
             if any(entry is None for entry in nexts):
                 return None  # the module says what is missing
             after_x, after_observed, after_action = (
-                entry.flatten(0, -2).index_select(0, last).unsqueeze(1) for entry in nexts
+                entry.flatten(0, -2).index_select(0, last) for entry in nexts
             )
-            # Sequences of one step that go on: a reset is where an episode starts, not where one
-            # ends.
-            after = belief(
-                out.mean.flatten(0, -2).index_select(0, last), None, after_action.to(mean.dtype),
-                after_x, after_observed, reset.new_zeros(len(last), 1),
-            )  # fmt: skip
-            total = total + after.log_likelihood.sum()
-            count, steps = count + after_observed.sum(), steps + len(last)
+            following = Following(last, after_action.to(mean.dtype), after_x, after_observed)
+    out = module.filter(
+        mean[..., 0, :], None, action, observation, observed, reset,
+        restart=first & ~reset, restart_mean=mean, following=following,
+    )  # fmt: skip
+    results = (out.mean, out.mean, out.log_likelihood, out.mean, age + 1)
+    written = dict(zip(module.out_keys, results, strict=True))
+    if model_loss is None:
+        return written, {}
+    total, count, steps = out.log_likelihood.sum(), observed.sum(), reset.numel()
+    if following is not None:
+        total = total + out.following_log_likelihood.sum()
+        count, steps = count + following.observed.sum(), steps + len(following.step)
     per_entry = total / count.clamp_min(1)
     loss = -per_entry if model_loss.normalize == "entry" else total / -float(max(1, steps))
     return written, {"loss_model": loss, "log_likelihood": per_entry.detach()}
