@@ -27,7 +27,7 @@ from torch import Tensor
 __all__ = ["NativeError", "load_library", "native_error", "spd_inverse"]
 
 # native.c, with the pieces native_*.h, is the filter, moments.c the running statistics, heads.c
-# PPO's terms of two small networks.
+# PPO's terms of two small networks, arrivals.c what goes missing.
 _FOLDER = Path(__file__).parent
 _MAX_SIZE = 64  # a group of matrices stays in cache up to here
 _REALS = {torch.float32: "float", torch.float64: "double"}
@@ -49,7 +49,7 @@ def load_library(dtype: torch.dtype, source: str = "native") -> ctypes.CDLL:
 
     Args:
         dtype: ``torch.float32`` or ``torch.float64``.
-        source: ``"native"``, ``"moments"`` or ``"heads"``.
+        source: ``"native"``, ``"moments"``, ``"heads"`` or ``"arrivals"``.
 
     Returns:
         Its functions.
@@ -112,7 +112,7 @@ def native_error(dtype: torch.dtype = torch.float32, source: str = "native") -> 
     Args:
         dtype: of the filter's tensors.
         source: ``"native"`` for the filter, ``"moments"`` for the running statistics, ``"heads"``
-            for PPO's terms.
+            for PPO's terms, ``"arrivals"`` for what goes missing.
 
     Returns:
         None where it can be had, else the reason.

@@ -139,7 +139,10 @@ def missing_probability(
 
 
 def sample_observed(
-    probability: Tensor | float, like: Tensor, generator: torch.Generator
+    probability: Tensor | float,
+    like: Tensor,
+    generator: torch.Generator,
+    uniform: Tensor | None = None,
 ) -> Tensor:
     """Draw which entries arrive, each one missing with its probability, independently.
 
@@ -147,6 +150,7 @@ def sample_observed(
         probability: of being missing; a number for all (MCAR) or shape `(*batch, obs)`.
         like: a tensor of shape `(*batch, obs)` on the generator's device.
         generator: source of randomness.
+        uniform: numbers in [0, 1) that were drawn from it before, shape `(*batch, obs)`.
 
     Returns:
         bool, shape `(*batch, obs)`, True where an entry arrives. The same generator state gives the
@@ -159,7 +163,8 @@ def sample_observed(
         >>> bool(sample_observed(1.0, x, torch.Generator()).any())
         False
     """
-    uniform = torch.rand(like.shape, generator=generator, device=like.device)
+    if uniform is None:
+        uniform = torch.rand(like.shape, generator=generator, device=like.device)
     # uniform < 1, so that probability 1 always misses; and where the probability is NaN, from a NaN
     # in the observation, the entry arrives: a mask must not hide that the simulation broke down
     return (uniform < probability).logical_not_()

@@ -35,12 +35,13 @@ class RunningNumbers(NamedTuple):
     inverse_scale: Tensor
 
 
-def takes_native(value: Tensor, observed: Tensor | None = None) -> bool:
+def takes_native(value: Tensor, observed: Tensor | None = None, source: str = "moments") -> bool:
     """Tell whether the C code takes these values.
 
     Args:
         value: shape ``(*batch, *event)``.
         observed: bool mask of the same shape, or None.
+        source: which C code, see :func:`.native_error`.
 
     Returns:
         False on another device or dtype, where memory is not contiguous, where a gradient is
@@ -65,7 +66,7 @@ def takes_native(value: Tensor, observed: Tensor | None = None) -> bool:
         )
         and not torch.compiler.is_compiling()
         and not torch._C._are_functorch_transforms_active()
-        and _available(value.dtype)
+        and _available(value.dtype, source)
     )
 
 
@@ -169,8 +170,8 @@ class _Functions(NamedTuple):
 
 
 @functools.cache
-def _available(dtype: torch.dtype) -> bool:
-    return native_error(dtype, "moments") is None
+def _available(dtype: torch.dtype, source: str) -> bool:
+    return native_error(dtype, source) is None
 
 
 @functools.cache

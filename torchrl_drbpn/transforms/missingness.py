@@ -12,12 +12,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from torchrl_drbpn.functional.arrivals import sample_arrivals
 from torchrl_drbpn.functional.corruption import (
     MissingnessKind,
     MissingnessMechanism,
     draw_mechanism,
-    missing_probability,
-    sample_observed,
 )
 from torchrl_drbpn.functional.gaussian import zero_missing
 from torchrl_drbpn.transforms._common import Role, as_key_list, fetch
@@ -137,18 +136,18 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
         following: TensorDictBase,
     ) -> tuple[Tensor, Tensor | None]:
         del following
-        probability: Tensor | float = self._eta
+        action = parameters = None
         if self.mechanism != "mcar":
-            if observed is not None:
-                # what lies beneath an earlier mask may be NaN, and must not enter the law
-                observation = zero_missing(observation, observed)
             action = None if root is None else self._action(root, observation)
             parameters = self._parameters_for(observation, action)
-            probability = missing_probability(parameters, observation, action, self._eta)
-        arrived = sample_observed(probability, observation, self.generator(observation.device))
-        if observed is not None:
-            arrived = arrived.logical_and_(observed)
-        return torch.where(arrived, observation, 0.0), arrived
+        return sample_arrivals(
+            parameters,
+            observation,
+            observed,
+            action,
+            self._eta,
+            self.generator(observation.device),
+        )
 
     def _action(self, root: TensorDictBase, observation: Tensor) -> Tensor:
         action = fetch(root, self.action_key)
