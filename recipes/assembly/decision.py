@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from assembly.agent import Agent
 from torchrl_drbpn import BeliefFilterModule
 from torchrl_drbpn.functional import StateSpace
+from torchrl_drbpn.functional.heads import PreparedPolicy, heads_refusal
 
 _LOG_SQRT_2PI = math.log(math.sqrt(2 * math.pi))
 
@@ -27,13 +28,16 @@ class _Spread(NamedTuple):
 
 
 class RolloutPolicy(TensorDictModuleBase):
-    r"""Write what ``agent.policy`` writes, bit for bit, without the objects around it.
+    r"""Write what ``agent.policy`` writes, without the objects around it.
 
     With loc and scale of the head and eps ~ N(0, 1) from the global generator:
 
     .. math::
         a = loc + eps \cdot scale, \qquad
         \log \pi(a) = \sum_i -\frac{(a_i - loc_i)^2}{2 scale_i^2} - \log scale_i - \log\sqrt{2\pi}
+
+    On the CPU the head is one call of C, equal to rounding; elsewhere the operations are those of
+    ``agent.policy`` run, to the last bit. Both draw the same random numbers.
 
     A ``ProbabilisticActor`` builds a distribution, checks its parameters and looks up keys at
     every step, which costs several times what the networks do for sixteen robots. It still decides
@@ -59,10 +63,11 @@ class RolloutPolicy(TensorDictModuleBase):
     _layers: list[nn.Module]
     _widen: nn.Module
     _spread: _Spread | None
+    _prepared: PreparedPolicy | None
 
     def refresh(self) -> None:
         """Forget what was computed from the parameters: to be called before every rollout."""
-        self.__dict__["_spread"] = self.__dict__["_model"] = None
+        self.__dict__["_spread"] = self.__dict__["_model"] = self.__dict__["_prepared"] = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the belief, the action, its distribution and its log-probability.
@@ -82,25 +87,54 @@ class RolloutPolicy(TensorDictModuleBase):
             if self._model is None:
                 self.__dict__["_model"] = self._filter.filter.state_space()
             tensordict = self._filter.step(tensordict, self._model)
-        loc: Tensor = tensordict._get_str("features", None)
-        for layer in self._layers:
-            if isinstance(layer, nn.Linear):
-                loc = nn.functional.linear(loc, layer.weight, layer.bias)
-            else:
-                loc = layer(loc)
-        spread = self._spread
-        if spread is None or spread.scale.shape != loc.shape:
-            _, scale = self._widen(loc)
-            spread = self.__dict__["_spread"] = _Spread(scale, 2 * scale**2, scale.log())
-        # The order of operations is that of torch.distributions.Normal: rsample, then log_prob.
-        action = torch.empty_like(loc).normal_().mul_(spread.scale).add_(loc)
-        log_prob = (action - loc).square_().neg_().div_(spread.twice_variance)
-        log_prob = log_prob.sub_(spread.log_scale).sub_(_LOG_SQRT_2PI).sum(-1)
+        features: Tensor = tensordict._get_str("features", None)
+        loc, scale, action, log_prob = self._decide(features)
         for key, value in (
             ("loc", loc),
-            ("scale", spread.scale),
+            ("scale", scale),
             ("action", action),
             ("action_log_prob", log_prob),
         ):
             tensordict._set_str(key, value, validated=True, inplace=False, non_blocking=False)
         return tensordict
+
+    def _decide(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return location, scale, action and log-probability."""
+        spread = self._spread
+        if spread is None or spread.scale.shape[:-1] != features.shape[:-1]:
+            loc = self._locate(features)
+            _, scale = self._widen(loc)
+            spread = self.__dict__["_spread"] = _Spread(scale, 2 * scale**2, scale.log())
+            self.__dict__["_prepared"] = self._prepare(features, scale)
+        noise = torch.empty_like(spread.scale).normal_()
+        prepared = self._prepared
+        if prepared is not None and features.is_contiguous():
+            loc, action, log_prob = prepared(features, noise)
+            return loc, spread.scale, action, log_prob
+        loc = self._locate(features)
+        # The order of operations is that of torch.distributions.Normal: rsample, then log_prob.
+        action = noise.mul_(spread.scale).add_(loc)
+        log_prob = (action - loc).square_().neg_().div_(spread.twice_variance)
+        log_prob = log_prob.sub_(spread.log_scale).sub_(_LOG_SQRT_2PI).sum(-1)
+        return loc, spread.scale, action, log_prob
+
+    def _locate(self, features: Tensor) -> Tensor:
+        loc = features
+        for layer in self._layers:
+            if isinstance(layer, nn.Linear):
+                loc = nn.functional.linear(loc, layer.weight, layer.bias)
+            else:
+                loc = layer(loc)
+        return loc
+
+    def _prepare(self, features: Tensor, scale: Tensor) -> PreparedPolicy | None:
+        """Lay the head out for C, where that runs."""
+        layers = [
+            part
+            for layer in self._layers
+            if isinstance(layer, nn.Linear)
+            for part in (layer.weight, layer.bias)
+        ]
+        if features.ndim != 2 or heads_refusal(layers, layers, features, scale) is not None:
+            return None
+        return PreparedPolicy(layers, scale[0].contiguous(), len(features))

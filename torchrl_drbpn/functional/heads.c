@@ -209,6 +209,34 @@ void heads_forward(const int64_t *dims, const double *bounds, void **p) {
     value_error(s, &tape, p[4], p[7]);
 }
 
+/* Actions of a rollout, from head 0 alone: location + scale noise, and their log-probability.
+ * p: features, noise, scale; location, action, log-probability; tape, scratch; the layers. */
+void heads_act(const int64_t *dims, void **p) {
+    Sizes z = read_sizes(dims), *s = &z;
+    const real *noise = p[1], *scale = p[2];
+    real *loc = p[3], *action = p[4], *log_prob = p[5];
+    Memory kept = {p[6], 0}, scratch = {p[7], 0};
+    Tape tape = lay_tape(s, &kept);
+    Scratch w = lay_scratch(s, &scratch);
+    long n = s->actions, wide = s->W[0][s->layers[0]];
+    const real *out = tape.input[0][s->layers[0]];
+    double constant = 0;
+    for (long j = 0; j < n; j++) constant -= log(scale[j]) + 0.5 * LOG_2PI;
+    pack(s->rows, s->features, p[0], s->features, 1, tape.input[0][0], s->W[0][0]);
+    run_head(s, &tape, &w, 0, p + 8);
+    for (long r = 0; r < s->rows; r++, out += wide) {
+        double sum = constant;
+        for (long j = 0; j < n; j++) {
+            long at = r * n + j;
+            loc[at] = out[j];
+            action[at] = noise[at] * scale[j] + out[j];
+            real z = (action[at] - out[j]) / scale[j]; /* what rounding left of the noise */
+            sum -= 0.5 * z * z;
+        }
+        log_prob[r] = sum;
+    }
+}
+
 /* ---------------------------------------------------------------- backward */
 
 /* Gradients of one head; those by the features are added where the head before has left its own. */

@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from torchrl_drbpn.functional.compiled import load_library, native_error
 
-__all__ = ["ClippedTerms", "clipped_heads", "heads_refusal"]
+__all__ = ["ClippedTerms", "PreparedPolicy", "clipped_heads", "heads_refusal"]
 
 _CPU = torch.device("cpu")
 _MAX_LAYERS = 8
@@ -197,6 +197,62 @@ class _ClippedHeads(torch.autograd.Function):
         return (None, of_features, None, None, None, None, of_scale, *of_layers)
 
 
+class PreparedPolicy:
+    r"""Decide for one batch after the other with the same parameters, without gradients.
+
+    .. math:: a = \mu + \sigma \epsilon, \qquad \log \pi(a) = \log N(a; \mu, \sigma)
+
+    mu is a network of tanh layers, sigma a number for each action. What does not change is laid out
+    once: a decision is one call of C.
+
+    Args:
+        layers: weight and bias of every layer of mu; :func:`heads_refusal` is None for them. They
+            must stay where they are in memory while this is used.
+        scale: sigma, shape ``(action,)``.
+        rows: how many decisions a call takes.
+
+    Example:
+        >>> import torch
+        >>> layers, scale = [torch.zeros(2, 3), torch.zeros(2)], torch.ones(2)
+        >>> if heads_refusal(layers, layers, scale) is None:
+        ...     loc, action, log_prob = PreparedPolicy(layers, scale, 4)(
+        ...         torch.randn(4, 3), torch.zeros(4, 2))
+        ...     assert torch.equal(loc, action) and log_prob.shape == (4,)
+    """
+
+    def __init__(self, layers: Sequence[Tensor], scale: Tensor, rows: int) -> None:
+        widths = [weight.shape[0] for weight in layers[0::2]]
+        features, self.actions, self.rows = layers[0].shape[1], scale.shape[0], rows
+        numbers = [rows, 1, self.actions, 0, features, len(widths), 0, *widths]
+        self._dims = (ctypes.c_int64 * len(numbers))(*numbers)
+        native = _load(scale.dtype)
+        counts = (ctypes.c_int64 * 2)()
+        native.sizes(self._dims, counts)
+        tape, scratch = (scale.new_empty(count) for count in counts)
+        self._kept = (tape, scratch, scale, *layers)
+        self._at = _pointers(None, None, scale, None, None, None, tape, scratch, *layers)
+        self._act = native.act
+
+    @torch.no_grad()
+    def __call__(self, features: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return location, action and log-probability.
+
+        Args:
+            features: shape ``(rows, features)``, contiguous, in the dtype of the layers.
+            noise: epsilon, shape ``(rows, action)``, likewise.
+
+        Returns:
+            Shapes ``(rows, action)`` twice and ``(rows,)``.
+        """
+        loc, action = torch.empty_like(noise), torch.empty_like(noise)
+        log_prob = noise.new_empty(self.rows)
+        at = self._at
+        at[0], at[1] = features.data_ptr(), noise.data_ptr()
+        at[3], at[4], at[5] = loc.data_ptr(), action.data_ptr(), log_prob.data_ptr()
+        self._act(self._dims, at)
+        return loc, action, log_prob
+
+
 def _pointers(*tensors: Tensor | None) -> ctypes.Array[ctypes.c_void_p]:
     at = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
     return (ctypes.c_void_p * len(at))(*at)
@@ -206,6 +262,7 @@ class _Functions(NamedTuple):
     sizes: ctypes._NamedFuncPointer
     forward: ctypes._NamedFuncPointer
     backward: ctypes._NamedFuncPointer
+    act: ctypes._NamedFuncPointer
 
 
 @functools.cache
@@ -216,7 +273,9 @@ def _error(dtype: torch.dtype) -> str | None:
 @functools.cache
 def _load(dtype: torch.dtype) -> _Functions:
     library = load_library(dtype, "heads")
-    out = _Functions(library.heads_sizes, library.heads_forward, library.heads_backward)
+    out = _Functions(
+        library.heads_sizes, library.heads_forward, library.heads_backward, library.heads_act
+    )
     for function in out:
         function.restype = None
     return out
