@@ -17,7 +17,7 @@ from torchrl_drbpn.functional.model import (
     constant_cov,
     predict_step,
 )
-from torchrl_drbpn.functional.native import NativeRecurrence
+from torchrl_drbpn.functional.native import NativeRecurrence, filter_rows
 from torchrl_drbpn.functional.recurrence import (
     InformationRecurrence,
     InnovationRecurrence,
@@ -90,17 +90,24 @@ def run_native(
         model.emission_offset, model.initial_mean,
         *(p for pair in zip(f.weights, f.biases, strict=True) for p in pair),
     )  # fmt: skip
-    mean, ll, after = NativeRecurrence.apply(  # type: ignore[no-untyped-call]
-        information, f.residual, f.activation, following,
+    sequence = (
         *map(rows, (observation, observed, action, reset, restart, stored)),
         start if start.stride(-1) == 1 else start.contiguous(),
-        *(x.contiguous() for x in parameters),
-    )  # fmt: skip
+    )
+    model_tensors = [x.contiguous() for x in parameters]
+    settings = (information, f.residual, f.activation)
+    after: Tensor | None = None
+    if following is None and not torch.is_grad_enabled():
+        mean, ll = filter_rows(settings, sequence, model_tensors)
+    else:
+        mean, ll, after = NativeRecurrence.apply(  # type: ignore[no-untyped-call]
+            *settings, following, *sequence, *model_tensors
+        )
     ll = ll.view(*batch, time)
     if information:
         ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
         ll = torch.where(observed.any(-1), ll, 0.0)
-        if following is not None:
+        if following is not None and after is not None:
             after = torch.where(following.observed.any(-1), after - 0.5 * log_det[0], 0.0)
     return mean.view(*batch, time, state), ll.to(dtype), None if after is None else after.to(dtype)
 

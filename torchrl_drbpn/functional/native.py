@@ -21,7 +21,7 @@ from torchrl_drbpn.functional.compiled import load_library, native_error
 from torchrl_drbpn.functional.model import StateSpace, choose_form
 from torchrl_drbpn.functional.recurrence import MeanNetwork
 
-__all__ = ["NativeRecurrence", "native_refusal"]
+__all__ = ["NativeRecurrence", "filter_rows", "native_refusal"]
 
 _CPU = torch.device("cpu")
 _MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
@@ -145,6 +145,23 @@ class NativeRecurrence(torch.autograd.Function):
         return (
             None, None, None, None, g_x, None, g_action, None, None, g_stored, g_start, *of_model,
         )  # fmt: skip
+
+
+def filter_rows(
+    settings: tuple[bool, bool, str], sequence: Sequence[Any], model: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return mean and log-likelihood without a graph: a decision needs none.
+
+    Args:
+        settings: the first three inputs of :class:`NativeRecurrence`.
+        sequence: its inputs from the observation to the start.
+        model: its inputs from Q on.
+
+    Returns:
+        Shapes ``(batch, time, state)`` and ``(batch, time)``.
+    """
+    _, mean, ll, _ = _ahead(settings, sequence, model)
+    return mean, ll
 
 
 class _Pass(NamedTuple):
