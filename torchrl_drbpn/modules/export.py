@@ -227,8 +227,9 @@ class PolicyStep(nn.Module):
             model.emission_offset,
         )  # fmt: skip
         if self.gate is not None:
-            both = self.get_buffer("initial_deviation"), self.get_buffer("deviation")
-            deviation = torch.where(reset, *both)
+            deviation = torch.where(
+                reset, self.get_buffer("initial_deviation"), self.get_buffer("deviation")
+            )
             observation = bounded(observation, observed, expected, deviation, self.gate)
         wide = self.get_buffer("wide_matrix").dtype  # float64, unless the module has been cast
         residual = zero_missing(observation - expected, observed).to(wide)
