@@ -27,13 +27,14 @@ from assembly.evaluation_grid import (
     parse_points,
 )
 from assembly.points import Point, check_reduction_seed, identity
+from assembly.report_evaluations import GRID_TABLE, POINTS_TABLE
 from assembly.report_runs import find_folders
 from assembly.robustness_figure import draw_robustness, read_rows
 from assembly.sensor_choice import kept_sensors
 from assembly.sensor_groups import have_names
 from assembly.sensors import sensor_names
 from assembly.settings import check_mode
-from assembly.trained import TrainedAgent, load_trained_agent, with_checkpoint
+from assembly.trained import TrainedAgent, gated, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
 
 
@@ -49,7 +50,7 @@ def run(config: dict[str, Any]) -> int:
     folders, protocol = _folders(config), _protocol(config)
     output = _output(config, folders)
     folders = with_checkpoint(folders)
-    agents = {folder: load_trained_agent(folder) for folder in folders}
+    agents = {folder: gated(load_trained_agent(folder), protocol.gate) for folder in folders}
     wanted = [(f, point) for f in folders for point in _points(config, f.name, agents[f])]
     results = Results(
         output,
@@ -115,12 +116,21 @@ def _protocol(config: dict[str, Any]) -> Protocol:
         spike_std=float(config["spike_std"]),
         reduction_seed=config["reduction_seed"],
         threads=config["threads"],
+        gate=config["gate"],
     )
 
 
 def _output(config: dict[str, Any], folders: Sequence[Path]) -> Path:
-    name = "robustness.csv" if config["points"] is None else "points.csv"
+    name, gate = Path(GRID_TABLE if config["points"] is None else POINTS_TABLE), config["gate"]
     place = folders[0] if len(folders) == 1 else Path()
+    if gate is not None:
+        # Reports read the tables of these names as those of the agent as it was trained.
+        name = name.with_name(f"{name.stem}-gate{gate}{name.suffix}")
+        if config["output"] and Path(config["output"]).name in (GRID_TABLE, POINTS_TABLE):
+            raise UserError(
+                f"`output` must not be called {Path(config['output']).name} with a gate, as "
+                f"reports would read it as without: take {name} or another name."
+            )
     output = Path(config["output"] or place / name)
     if not output.parent.is_dir():
         raise UserError(f"`output` must lie in an existing folder, got {output}.")

@@ -57,7 +57,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
     point = parse_point("mcar:0.5", settings, spike_std=5.0)
-    protocol = evaluation_grid.Protocol(3, ["sampled"], 1, 5.0, 0, 1)
+    protocol = evaluation_grid.Protocol(3, ["sampled"], 1, 5.0, 0, 1, None)
     ((_, _, expected),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
     step, calls, actions = BeliefFilter.step, [], []
 
@@ -86,7 +86,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     assert len(stopped) > 0
     assert (stopped == 0).all()
     assert (np.stack(actions)[:2, 1] != 0).all()
-    assert agent_of(drbpn).agent.belief.filter.validate  # who asks by himself is told
+    assert agent_of(drbpn, None).agent.belief.filter.validate  # who asks by himself is told
 
 
 @pytest.mark.parametrize("command", ["evaluate", "diagnose"])
@@ -104,7 +104,7 @@ def test_the_belief_of_an_episode_that_is_over_goes_no_further(
     monkeypatch.setattr(BeliefFilter, "step", look)
     point = parse_point("mcar:0.5", settings, spike_std=5.0)
     if command == "evaluate":
-        protocol = evaluation_grid.Protocol(4, ["sampled"], 1, 5.0, 0, 1)
+        protocol = evaluation_grid.Protocol(4, ["sampled"], 1, 5.0, 0, 1, None)
         ((_, _, rows),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
         lengths = [row["length"] for row in rows]
     else:

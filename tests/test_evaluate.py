@@ -414,6 +414,46 @@ def test_bad_settings_are_one_line(
         evaluate(tmp_path / "out.csv", drbpn, points="none:0", **options)
 
 
+# A gate ---------------------------------------------------------------------------------------
+
+
+def test_a_gate_changes_what_spikes_do_and_tells_in_the_table(drbpn: Path, tmp_path: Path) -> None:
+    out, points = tmp_path / "out.csv", "'spikes:1:50'"
+    believed = evaluate(out, drbpn, points=points)
+    bounded = evaluate(tmp_path / "bounded.csv", drbpn, points=points, gate=1)
+    assert {row["method"] for row in believed} == {"drbpn"}
+    assert {row["method"] for row in bounded} == {"drbpn, gate 1"}
+    assert [r["log_likelihood"] for r in believed] != [r["log_likelihood"] for r in bounded]
+    two = evaluate(tmp_path / "two.csv", drbpn, points=points + ",none:0", gate=1, processes=2)
+    assert [row for row in two if row["point"] != "none:0"] == bounded
+    with pytest.raises(UserError, match="with method drbpn, and drbpn, gate 1 is asked for"):
+        evaluate(out, drbpn, points=points, gate=1)
+
+
+def test_tables_with_a_gate_have_a_name_of_their_own(drbpn: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(drbpn, folder)
+    base = configured("points=[none:0]", "gate=2.5") | {"run": str(folder), "figures": False}
+    assert recipe.run(base | {"processes": 1, "episodes": 2}) == 0
+    assert (folder / "points-gate2.5.csv").is_file()
+    assert not (folder / "points.csv").exists()
+    with pytest.raises(UserError, match=r"`output` must not be called points\.csv with a gate"):
+        recipe.run(base | {"output": str(folder / "points.csv")})
+
+
+@pytest.mark.parametrize("gate", [0, "wide", True])
+def test_a_gate_that_is_no_positive_number_is_one_line(
+    drbpn: Path, tmp_path: Path, gate: Any
+) -> None:
+    with pytest.raises(UserError, match="`gate` must be a positive, finite number"):
+        evaluate(tmp_path / "out.csv", drbpn, points="none:0", gate=gate)
+
+
+def test_a_belief_without_a_forecast_has_no_gate(feedforward: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="`gate` must be null for belief=none, got 3"):
+        evaluate(tmp_path / "out.csv", feedforward, points="none:0", gate=3)
+
+
 # Sensors that fail together -------------------------------------------------------------------
 
 

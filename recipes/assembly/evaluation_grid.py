@@ -24,7 +24,7 @@ from assembly.errors import UserError
 from assembly.points import Point, episode_rows, evaluate_points, parse_point
 from assembly.run_folder import write_table
 from assembly.settings import Settings
-from assembly.trained import TrainedAgent, load_trained_agent
+from assembly.trained import TrainedAgent, gated, load_trained_agent
 
 Row = Mapping[str, Any]
 
@@ -58,6 +58,7 @@ class Protocol:
     spike_std: float
     reduction_seed: int
     threads: int
+    gate: float | None
 
 
 # Which points ---------------------------------------------------------------------------------
@@ -235,7 +236,7 @@ def evaluate_point(
         One row an episode and kind of action.
     """
     torch.set_num_threads(protocol.threads)
-    trained = agent_of(folder)
+    trained = agent_of(folder, protocol.gate)
     drawn = {"reduction_seed": protocol.reduction_seed if point.selection == "random" else None}
     rows = []
     for _, mode, result in evaluate_points(
@@ -252,16 +253,17 @@ def evaluate_point(
 
 
 @lru_cache(maxsize=1)
-def agent_of(folder: Path) -> TrainedAgent:
+def agent_of(folder: Path, gate: float | None) -> TrainedAgent:
     """Return a run's agent; the points of a run come one after the other and share it.
 
     Args:
         folder: the run folder.
+        gate: see :func:`assembly.trained.gated`.
 
     Returns:
         Its last checkpoint.
     """
-    return load_trained_agent(folder)
+    return gated(load_trained_agent(folder), gate)
 
 
 def evaluate_tasks(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchrl.envs import TransformedEnv
@@ -18,6 +18,7 @@ from assembly.methods import method_label, read_cell
 from assembly.run_folder import read_config
 from assembly.settings import Settings, read_settings
 from assembly.training import make_agent
+from torchrl_drbpn import BeliefFilterModule
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,35 @@ def load_trained_agent(folder: Path) -> TrainedAgent:
     study, choices = read_cell(folder)
     method = method_label(settings, choices)
     return TrainedAgent(settings, belief, agent, statistics, frames, method, study)
+
+
+def gated(trained: TrainedAgent, gate: float | None) -> TrainedAgent:
+    """Let an agent bound what a reading far from its forecast does to its belief.
+
+    Args:
+        trained: the agent; its belief module is changed in place.
+        gate: standard deviations of the innovation; None: every reading is believed.
+
+    Returns:
+        The agent. Its method names the gate, so that no table or figure takes it for the one
+        without.
+
+    Raises:
+        UserError: if its belief forecasts no readings, or the gate is refused.
+    """
+    if gate is None:
+        return trained
+    module = trained.agent.belief
+    if not isinstance(module, BeliefFilterModule):
+        raise UserError(
+            f"`gate` must be null for belief={trained.settings.belief.get('name')}, got {gate!r}: "
+            "only belief=drbpn has a forecast of its readings to hold them against."
+        )
+    try:
+        module.gate = gate
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return replace(trained, method=f"{trained.method}, gate {gate:g}")
 
 
 def with_checkpoint(folders: Sequence[Path]) -> list[Path]:

@@ -61,6 +61,7 @@ from torchrl_drbpn.functional.particles import (
     systematic_ancestors,
 )
 from torchrl_drbpn.functional.recurrence import MeanNetwork
+from torchrl_drbpn.functional.saturation import saturate_innovation
 from torchrl_drbpn.functional.selection import SensorSelection, select_sensors
 
 __all__ = [
@@ -118,6 +119,7 @@ __all__ = [
     "sample_observed",
     "sample_spikes",
     "sample_working",
+    "saturate_innovation",
     "select_sensors",
     "systematic_ancestors",
     "tril_to_vector",

@@ -20,6 +20,7 @@ from torchrl_drbpn.functional import (
     filter_sequence,
     filter_step,
     predict_step,
+    saturate_innovation,
 )
 from torchrl_drbpn.functional.model import Form, checked_form
 from torchrl_drbpn.functional.precision import outside_autocast
@@ -218,6 +219,7 @@ class BeliefFilter(nn.Module):
         *,
         return_cov: bool = False,
         model: StateSpace | None = None,
+        gate: float | None = None,
     ) -> FilterOutput:
         """Filter one step.
 
@@ -234,18 +236,26 @@ class BeliefFilter(nn.Module):
             return_cov: whether the filtered covariance is wanted.
             model: what :meth:`state_space` returned, for many steps with the same parameters; it
                 is built anew by default.
+            gate: readings further than about this many standard deviations from their forecast
+                are filtered as if they lay at that distance, and the likelihood is that of these,
+                see :func:`torchrl_drbpn.functional.saturate_innovation`; None: believe them all.
 
         Returns:
             :class:`~torchrl_drbpn.functional.FilterOutput`: mean, cov (None where not asked
             for), log_likelihood.
 
         Raises:
-            ValueError: for a shape, a dtype or an observed value that cannot be.
+            ValueError: for a shape, a dtype, a gate or an observed value that cannot be.
         """
         del cov
         self._check_shapes(mean, previous_action, observation, observed, reset)
+        model = self.state_space() if model is None else model
+        if gate is not None:
+            observation = saturate_innovation(
+                model, mean, previous_action, observation, observed, reset, gate
+            )
         out = filter_step(
-            self.state_space() if model is None else model,
+            model,
             mean,
             previous_action,
             observation,

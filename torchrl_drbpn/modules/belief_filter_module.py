@@ -17,6 +17,7 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torchrl_drbpn.functional import StateSpace, tril_to_vector
 from torchrl_drbpn.functional.precision import outside_autocast
+from torchrl_drbpn.functional.saturation import check_gate
 from torchrl_drbpn.modules._keys import read_entry, read_in_keys, read_out_keys
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 
@@ -73,11 +74,16 @@ class BeliefFilterModule(TensorDictModuleBase):
         policy_input: what ``features`` holds, for policy and value to read (eq. 11 [DRBPN]):
             "mean", or "mean_cov" (lower triangle of the filtered covariance behind the mean).
         default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
+        gate: for an agent that is trained and acts among readings that arrive and are wrong:
+            those further than about this many standard deviations from their forecast count as if
+            they lay at that distance (:func:`torchrl_drbpn.functional.saturate_innovation`), and
+            ``("belief", "log_likelihood")`` is that of what was counted. None, the default: every
+            reading is believed. One step at a time only; the attribute ``gate`` may be set later.
 
     Raises:
         TypeError: if keys are neither a list nor a dict.
-        ValueError: for a key list of another length, an unknown name, a key given twice, or an
-            unknown choice.
+        ValueError: for a key list of another length, an unknown name, a key given twice, an
+            unknown choice, or a gate that is not positive and finite.
 
     Example:
         >>> import torch
@@ -104,6 +110,7 @@ class BeliefFilterModule(TensorDictModuleBase):
         out_keys: Sequence[NestedKey] | Mapping[NestedKey, NestedKey] | None = None,
         policy_input: Literal["mean", "mean_cov"] = "mean",
         default_recurrent_mode: bool | None = None,
+        gate: float | None = None,
     ) -> None:
         super().__init__()
         if policy_input not in ("mean", "mean_cov"):
@@ -112,6 +119,7 @@ class BeliefFilterModule(TensorDictModuleBase):
         self.policy_input = policy_input
         self._default_recurrent_mode = default_recurrent_mode
         self._warned = False
+        self.gate = gate
         self.in_keys = read_in_keys(in_keys, IN_KEYS, "the filter")
         self._next_mean = unravel_key(("next", self.in_keys[4]))
         self._next_age = unravel_key(("next", self.in_keys[5]))
@@ -168,6 +176,12 @@ class BeliefFilterModule(TensorDictModuleBase):
         mean = tensordict.get(self.in_keys[4], None)
         age = tensordict.get(self.in_keys[5], None)
         first = is_init.squeeze(-1)
+        if sequence and self.gate is not None:
+            raise ValueError(
+                f"`gate` is {self.gate:g}, and the mode is recurrent: a gate is for an agent that "
+                "is trained and works one step at a time. Train without one (gate = None) and set "
+                "it afterwards."
+            )
         if sequence and first.ndim == 0:
             raise ValueError(
                 "under set_recurrent_mode(True) the last batch dimension is time, but the input "
@@ -191,7 +205,7 @@ class BeliefFilterModule(TensorDictModuleBase):
         else:
             out = self.filter.step(
                 mean, None, action, observation, observed, reset,
-                return_cov=want_cov, model=model,
+                return_cov=want_cov, model=model, gate=self.gate,
             )  # fmt: skip
 
         tensordict.set(self._next_mean, out.mean)
@@ -248,6 +262,17 @@ class BeliefFilterModule(TensorDictModuleBase):
             ("belief", "predicted_observation"): emission(predicted.mean, action),
             ("belief", "innovation_cov"): cov,
         }
+
+    @property
+    def gate(self) -> float | None:
+        """Standard deviations beyond which an innovation is saturated; None: nowhere."""
+        return self._gate
+
+    @gate.setter
+    def gate(self, gate: float | None) -> None:
+        if gate is not None:
+            check_gate(gate)
+        self._gate = gate
 
     @property
     def feature_dim(self) -> int:

@@ -13,9 +13,11 @@ from torchrl_drbpn.functional import (
     choose_form,
     filter_step,
     filtered_cov,
+    saturate_innovation,
     tril_to_vector,
     zero_missing,
 )
+from torchrl_drbpn.functional.saturation import bounded, reading_variance
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 
 __all__ = ["PolicyStep"]
@@ -33,7 +35,7 @@ class PolicyStep(nn.Module):
     P_0 H' and both innovation covariances H P H' + R, or in the information form (diagonal R,
     obs > state) the precisions and the products h_i h_i'. A step is left with one small
     factorisation, the transition network and the head. A transition of the user's own, or a Q that
-    is a network, is evaluated as it is at every step.
+    is a network, is evaluated as it is at every step. A ``gate`` of the belief module is kept.
 
     It has no TensorDict and no branch on values, so ``torch.export.export`` takes it, with a
     dynamic batch too, and ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time.
@@ -87,7 +89,7 @@ class PolicyStep(nn.Module):
             )
         if (action_low is None) != (action_high is None):
             raise ValueError("`action_low` and `action_high` must be given together or not at all.")
-        self.policy_input = belief.policy_input
+        self.policy_input, self.gate = belief.policy_input, belief.gate
         self.head = copy.deepcopy(head).requires_grad_(False)
         filter = copy.deepcopy(belief.filter).requires_grad_(False)
         with torch.no_grad():
@@ -121,6 +123,10 @@ class PolicyStep(nn.Module):
         H, Q, P0 = model.emission_matrix, model.transition_cov, model.initial_cov
         assert isinstance(Q, Tensor)
         self._keep("wide_matrix", H)
+        if self.gate is not None:
+            for name, P in (("deviation", Q), ("initial_deviation", P0)):
+                deviation = reading_variance(H, P, model.emission_cov).sqrt()
+                self._keep(name, deviation.to(self.get_buffer("expectation").dtype))
         if self.form == "innovation":
             R = model.full_emission_cov()
             self._keep("cross", H @ Q)
@@ -184,10 +190,14 @@ class PolicyStep(nn.Module):
         reset = is_init & (age == 0)
         if self.filter is not None:
             wants_cov = self.policy_input == "mean_cov"
+            model, row = self.filter.state_space(), reset.squeeze(-1)
+            if self.gate is not None:
+                observation = saturate_innovation(
+                    model, mean, previous_action, observation, observed, row, self.gate
+                )
             out = filter_step(
-                self.filter.state_space(), mean, previous_action, observation, observed,
-                reset.squeeze(-1), return_cov=wants_cov,
-            )  # fmt: skip
+                model, mean, previous_action, observation, observed, row, return_cov=wants_cov
+            )
             filtered, cov = out.mean, out.cov
         else:
             filtered = self._update(observation, observed, previous_action, reset, mean)
@@ -216,6 +226,11 @@ class PolicyStep(nn.Module):
             torch.cat([m, previous_action], -1), self.get_buffer("expectation"),
             model.emission_offset,
         )  # fmt: skip
+        if self.gate is not None:
+            deviation = torch.where(
+                reset, self.get_buffer("initial_deviation"), self.get_buffer("deviation")
+            )
+            observation = bounded(observation, observed, expected, deviation, self.gate)
         wide = self.get_buffer("wide_matrix").dtype  # float64, unless the module has been cast
         residual = zero_missing(observation - expected, observed).to(wide)
         row = reset.unsqueeze(-1)

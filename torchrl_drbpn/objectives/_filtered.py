@@ -96,6 +96,7 @@ def _known(module: nn.Module, model_loss: BeliefModelLoss | None, data: TensorDi
         or type(module.filter) is not BeliefFilter
         or hooked(module)
         or module.policy_input != "mean"
+        or module.gate is not None  # the module says that it is for acting
         or len(module.out_keys) != len(_OUT_KEYS) + 2
         or module.out_keys[:3] != _OUT_KEYS
         or not data.ndim

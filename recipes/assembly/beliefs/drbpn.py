@@ -63,7 +63,9 @@ def observing(module: BeliefFilterModule) -> TensorDictSequential:
     cov = ("belief", "cov")
     wanted = ["features", ("belief", "mean"), ("belief", "log_likelihood"), cov]
     wanted += [ESTIMATE, FORECAST, FORECAST_COV]
-    filtering = BeliefFilterModule(module.filter, policy_input=module.policy_input, out_keys=wanted)
+    filtering = BeliefFilterModule(
+        module.filter, policy_input=module.policy_input, out_keys=wanted, gate=module.gate
+    )
     variances = TensorDictModule(
         SensorVariances(module.filter.emission),
         in_keys=[cov],
