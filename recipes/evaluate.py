@@ -37,6 +37,8 @@ from assembly.settings import check_mode
 from assembly.trained import TrainedAgent, gated, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
 
+from torchrl_drbpn.functional.saturation import check_gate
+
 
 def run(config: dict[str, Any]) -> int:
     """Evaluate what is not yet in the table, write it, and draw it.
@@ -105,6 +107,11 @@ def _protocol(config: dict[str, Any]) -> Protocol:
         ):
             raise UserError(f"`{name}` must be a whole number of at least 1, got {value!r}.")
     check_reduction_seed(config["reduction_seed"])
+    if config["gate"] is not None:
+        try:
+            check_gate(config["gate"])
+        except ValueError as error:
+            raise UserError(str(error)) from error
     if not config["modes"]:
         raise UserError("`modes` must hold sampled, mean or both, got none.")
     for mode in config["modes"]:
@@ -125,7 +132,7 @@ def _output(config: dict[str, Any], folders: Sequence[Path]) -> Path:
     place = folders[0] if len(folders) == 1 else Path()
     if gate is not None:
         # Reports read the tables of these names as those of the agent as it was trained.
-        name = name.with_name(f"{name.stem}-gate{gate}{name.suffix}")
+        name = name.with_name(f"{name.stem}-gate{gate:g}{name.suffix}")
         if config["output"] and Path(config["output"]).name in (GRID_TABLE, POINTS_TABLE):
             raise UserError(
                 f"`output` must not be called {Path(config['output']).name} with a gate, as "

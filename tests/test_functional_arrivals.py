@@ -105,6 +105,12 @@ def test_what_the_c_code_does_not_take_runs_in_pytorch(monkeypatch):
         torch.testing.assert_close(out[0], expected[0])
         return out[0]
 
+    with pytest.raises(RuntimeError):  # PyTorch's own error
+        sample_arrivals(mechanism, x, observed, action[..., :2], eta, torch.Generator())
+    with pytest.raises(RuntimeError):
+        sample_arrivals(mechanism, x[..., :5], None, action, eta, torch.Generator())
+    sample_arrivals(mechanism, x, observed, action[0, 0], eta, torch.Generator())  # broadcast
+    sample_arrivals(None, x[0, 0, 0], None, None, eta, torch.Generator())
     check(x=x.transpose(0, 1).contiguous().transpose(0, 1))
     check(action=action.transpose(0, 1).contiguous().transpose(0, 1))
     weight = mechanism.observation_weight

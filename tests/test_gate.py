@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_drbpn import (
+    BeliefDivergedError,
     BeliefFilter,
     BeliefFilterModule,
     BeliefModelLoss,
@@ -297,3 +298,28 @@ def test_float32_and_a_transition_of_ones_own_take_a_gate_too() -> None:
         wide = by_hand(model, 1.0, (mean.float(), *narrow[2:]))[1]
         assert out.mean.dtype == torch.float32
         torch.testing.assert_close(out.mean, wide.float(), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("gate", [None, 3.0])
+@pytest.mark.parametrize(
+    ("spoiled", "error", "message"),
+    [
+        ("model", BeliefDivergedError, "the learned model diverged"),
+        ("mean", ValueError, "`mean` holds NaN"),
+        ("action", ValueError, "`previous_action` holds NaN"),
+        ("observation", ValueError, "`observation` holds NaN"),
+    ],
+)
+def test_an_error_names_its_cause_with_a_gate_too(spoiled, error, message, gate):
+    model = make()
+    mean, action, observation, observed, reset = inputs(model)
+    observed[:], reset[:] = True, False
+    with torch.no_grad():
+        if spoiled == "model":
+            for name, parameter in model.transition.named_parameters():
+                if name.endswith("weight"):
+                    parameter.fill_(torch.inf)
+        else:
+            {"mean": mean, "action": action, "observation": observation}[spoiled][3] = torch.nan
+    with pytest.raises(error, match=message):
+        model.step(mean, None, action, observation, observed, reset, gate=gate)

@@ -5,6 +5,8 @@ To the last bit in PyTorch's operations, to rounding where its head is one call 
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 
 import pytest
@@ -54,7 +56,7 @@ def assert_same(first: TensorDictBase, second: TensorDictBase, exact: bool = Tru
 def exact(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether the head runs in PyTorch's operations; else it must have run in C."""
     if request.param == "PyTorch":
-        monkeypatch.setattr(decision, "heads_refusal", lambda *_: "not wanted")
+        monkeypatch.setattr(decision, "policy_refusal", lambda *_: "not wanted")
         return True
     if native_error(torch.float32, "heads") is not None:
         pytest.skip("no C compiler here")
@@ -103,3 +105,10 @@ def test_gradients_come_from_the_actor() -> None:
     _, policy, root = make("drbpn")
     out = policy(root.copy())
     assert out["action_log_prob"].requires_grad
+
+
+def test_it_can_be_copied_and_pickled_after_a_decision(exact: bool) -> None:
+    _, policy, root = make("drbpn")
+    expected = decide(policy, root)
+    for copied in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
+        assert_same(expected, decide(copied, root))

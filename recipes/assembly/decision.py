@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from assembly.agent import Agent
 from torchrl_drbpn import BeliefFilterModule
 from torchrl_drbpn.functional import StateSpace
-from torchrl_drbpn.functional.heads import PreparedPolicy, heads_refusal
+from torchrl_drbpn.functional.heads import PreparedPolicy, policy_refusal
 
 _LOG_SQRT_2PI = math.log(math.sqrt(2 * math.pi))
 
@@ -69,6 +69,11 @@ class RolloutPolicy(TensorDictModuleBase):
         """Forget what was computed from the parameters: to be called before every rollout."""
         self.__dict__["_spread"] = self.__dict__["_model"] = self.__dict__["_prepared"] = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was computed: a copy computes its own."""
+        nothing = dict.fromkeys(("_spread", "_model", "_prepared"))
+        return {**super().__getstate__(), **nothing}
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the belief, the action, its distribution and its log-probability.
 
@@ -108,7 +113,7 @@ class RolloutPolicy(TensorDictModuleBase):
             self.__dict__["_prepared"] = self._prepare(features, scale)
         noise = torch.empty_like(spread.scale).normal_()
         prepared = self._prepared
-        if prepared is not None and features.is_contiguous():
+        if prepared is not None and prepared.takes(features):
             loc, action, log_prob = prepared(features, noise)
             return loc, spread.scale, action, log_prob
         loc = self._locate(features)
@@ -135,6 +140,7 @@ class RolloutPolicy(TensorDictModuleBase):
             if isinstance(layer, nn.Linear)
             for part in (layer.weight, layer.bias)
         ]
-        if features.ndim != 2 or heads_refusal(layers, layers, features, scale) is not None:
+        spread = scale.reshape(-1, scale.shape[-1])[0].contiguous()
+        if policy_refusal(layers, features, spread) is not None:
             return None
-        return PreparedPolicy(layers, scale[0].contiguous(), len(features))
+        return PreparedPolicy(layers, spread, len(features))

@@ -59,7 +59,8 @@ def sample_arrivals(
     """
     uniform = torch.rand(observation.shape, generator=generator, device=observation.device)
     if (
-        takes_native(observation, observed, "arrivals")
+        observation.ndim > 0
+        and takes_native(observation, observed, "arrivals")
         and uniform.dtype is torch.float32
         and (mechanism is None or _takes(mechanism, observation, previous_action))
     ):
@@ -77,7 +78,13 @@ def sample_arrivals(
 def _takes(mechanism: MissingnessMechanism, observation: Tensor, action: Tensor | None) -> bool:
     """Tell whether C may read these addresses."""
     given = [*mechanism[1:], *(() if action is None else (action,))]
-    return all(
+    n, actions = observation.shape[-1], mechanism.action_weight.shape[-1]
+    return (
+        mechanism.observation_weight.shape == (n, n)
+        and mechanism.bias.shape == (n,)
+        and mechanism.action_weight.shape == (n, actions)
+        and (action is None or action.shape == (*observation.shape[:-1], actions))
+    ) and all(
         value.dtype is observation.dtype
         and value.device == observation.device
         and value.is_contiguous()

@@ -129,7 +129,7 @@ static void run_head(const Sizes *s, const Tape *tape, const Scratch *w, int hea
 static void clip_gain(const Sizes *s, const Tape *tape, const Scratch *w, void **p, double low,
                       double high, double scale_floor) {
     const real *action = p[1], *old = p[2], *advantage = p[3], *log_scale = p[5];
-    real *objective = p[6], *metrics = p[8], *sample_size = p[9], *ratio = w->row;
+    real *objective = p[6], *metrics = p[8], *sample_size = p[9], *kept = w->row;
     long n = s->actions, wide = s->W[0][s->layers[0]];
     real *scale = w->weight, *loc = tape->input[0][s->layers[0]];
     double by_scale[n], gained = 0, outside = 0, moved = 0, sum = 0, constant = 0;
@@ -150,19 +150,19 @@ static void clip_gain(const Sizes *s, const Tape *tape, const Scratch *w, void *
         real log_ratio = log_prob - old[r];
         real clipped = log_ratio < (real)low ? low : log_ratio > (real)high ? high : log_ratio;
         real limit = exp(clipped); /* rounded as the ratio is: inside the bounds the two are equal */
-        ratio[r] = exp(log_ratio);
-        real gain = ratio[r] * advantage[r];
+        real ratio = exp(log_ratio), gain = ratio * advantage[r];
         limit *= advantage[r];
         /* d(w A) / d log w = w A; the clipped gain is the smaller one where its gradient is 0 */
-        real by = gain <= limit ? -gain / s->rows : 0;
-        gained += gain <= limit ? gain : limit;
+        real by = gain > limit ? 0 : -gain / s->rows; /* NaN stays */
+        gained += gain > limit ? limit : gain;
         for (long j = 0; j < n; j++) {
             real z = loc[j];
             loc[j] = by * z / scale[j];
             by_scale[j] += by * (z * z - 1);
         }
-        outside += clipped != log_ratio, moved += log_ratio, sum += ratio[r];
-        if (!(ratio[r] <= largest)) largest = ratio[r];
+        outside += clipped != log_ratio, moved += log_ratio, sum += ratio;
+        if (largest == largest && !(ratio <= largest)) largest = ratio; /* NaN stays */
+        kept[r] = log_ratio;
     }
     /* by the logarithm: d scale / d log scale = scale, 0 where the floor holds it up */
     for (long j = 0; j < n; j++)
@@ -171,9 +171,10 @@ static void clip_gain(const Sizes *s, const Tape *tape, const Scratch *w, void *
     metrics[0] = outside / s->rows, metrics[1] = -moved / s->rows;
     metrics[2] = largest, metrics[3] = sum / s->rows;
     for (long c = 0; c < s->columns; c++) { /* of each column, as ClipPPOLoss has it */
-        double total = 0, squares = 0;
+        double total = 0, squares = 0, highest = -INFINITY;
+        for (long r = c; r < s->rows; r += s->columns) highest = fmax(highest, kept[r]);
         for (long r = c; r < s->rows; r += s->columns) {
-            double weight = ratio[r] / largest;
+            double weight = exp(kept[r] - highest);
             total += weight, squares += weight * weight;
         }
         sample_size[c] = total * total / squares / (s->rows / s->columns);
@@ -187,6 +188,7 @@ static void value_error(const Sizes *s, const Tape *tape, const real *target, re
     double sum = 0;
     for (long r = 0; r < s->rows; r++, value += wide) {
         real d = *value - target[r], size = fabs(d), sign = (d > 0) - (d < 0);
+        if (s->kind == 2 && d != d) sign = d; /* as PyTorch's distances: l1 alone forgets a NaN */
         int square = s->kind == 0 || (s->kind == 2 && size < 1); /* l2, l1, smooth l1 */
         sum += square ? (s->kind ? 0.5 : 1) * d * d : s->kind == 1 ? size : size - 0.5;
         *value = (square ? (s->kind ? d : 2 * d) : sign) / s->rows;
@@ -239,9 +241,9 @@ void heads_act(const int64_t *dims, void **p) {
 
 /* ---------------------------------------------------------------- backward */
 
-/* Gradients of one head; those by the features are added where the head before has left its own. */
+/* Gradients of one head; those by the features are added to what is there where `add` says so. */
 static void head_back(const Sizes *s, const Tape *tape, const Scratch *w, int head, real by,
-                      void **layers, void **g_layers, real *g_features) {
+                      void **layers, void **g_layers, real *g_features, int add) {
     long last = s->layers[head];
     const real *top = tape->input[head][last];
     real *delta = w->by_layer[last % 2];
@@ -269,13 +271,14 @@ static void head_back(const Sizes *s, const Tape *tape, const Scratch *w, int he
         for (long r = 0; r < s->rows; r++)
             for (long k = 0; k < in; k++) {
                 real *to = g_features + r * in + k;
-                *to = below[r * W_in + k] + (head ? *to : 0);
+                *to = below[r * W_in + k] + (add ? *to : 0);
             }
     }
 }
 
-/* p: gradients by objective and by error (may be absent), tape, scratch; out: gradients by features
- * (may be absent) and by log scale; then weight and bias of every layer, then their gradients. */
+/* p: gradients by objective and by error, tape, scratch; out: gradients by features (may be absent)
+ * and by log scale; then weight and bias of every layer, then their gradients. Where one of the first
+ * two is absent, nothing of its head is computed or written. */
 void heads_backward(const int64_t *dims, void **p) {
     Sizes z = read_sizes(dims), *s = &z;
     const real *by[2] = {p[0], p[1]};
@@ -284,8 +287,11 @@ void heads_backward(const int64_t *dims, void **p) {
     Scratch w = lay_scratch(s, &scratch);
     real *g_scale = p[5];
     void **layers = p + 6, **g_layers = layers + 2 * (s->layers[0] + s->layers[1]);
-    for (long j = 0; j < s->actions; j++) g_scale[j] = by[0] ? *by[0] * tape.by_scale[j] : 0;
-    for (int h = 0; h < 2; h++)
-        head_back(s, &tape, &w, h, by[h] ? *by[h] : 0, layers + 2 * h * s->layers[0],
-                  g_layers + 2 * h * s->layers[0], p[4]);
+    for (long j = 0; by[0] && j < s->actions; j++) g_scale[j] = *by[0] * tape.by_scale[j];
+    for (int h = 0, add = 0; h < 2; h++) {
+        if (!by[h]) continue;
+        head_back(s, &tape, &w, h, *by[h], layers + 2 * h * s->layers[0],
+                  g_layers + 2 * h * s->layers[0], p[4], add);
+        add = 1;
+    }
 }

@@ -250,20 +250,22 @@ class BeliefFilter(nn.Module):
         del cov
         self._check_shapes(mean, previous_action, observation, observed, reset)
         model = self.state_space() if model is None else model
+        believed = observation
         if gate is not None:
-            observation = saturate_innovation(
+            believed = saturate_innovation(
                 model, mean, previous_action, observation, observed, reset, gate
             )
         out = filter_step(
             model,
             mean,
             previous_action,
-            observation,
+            believed,
             observed,
             reset,
             return_cov=return_cov,
             form=self.form,
         )
+        # What arrived, not what a belief gone astray has made of it: the error names the cause.
         self._check_values(out, mean, previous_action, observation, observed)
         return out
 

@@ -16,7 +16,7 @@ from torchrl.modules import IndependentNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_drbpn.functional.heads import clipped_heads, heads_refusal
+from torchrl_drbpn.functional.heads import clipped_heads
 from torchrl_drbpn.objectives._filtered import hooked
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -36,7 +36,7 @@ class _ClippedGain(torch.autograd.Function):
         clipped = log_ratio.clamp(low, high)
         gain, clipped_gain = log_ratio.exp() * advantage, clipped.exp() * advantage
         # d(w A) / d log w = w A; the clipped gain is the smaller one where its own gradient is 0.
-        by = torch.where(gain <= clipped_gain, gain, 0.0).unsqueeze(-1) * (-1.0 / gain.numel())
+        by = torch.where(gain > clipped_gain, 0.0, gain).unsqueeze(-1) * (-1.0 / gain.numel())
         by = by / scale
         ctx.save_for_backward(by * z, by * (square - 1.0))
         ctx.mark_non_differentiable(log_ratio, clipped)
@@ -94,13 +94,12 @@ def plain_terms(
     error = distance_loss(data.get(keys.value_target), value, loss_function=ppo.loss_critic_type)
     with torch.no_grad():
         ratio = log_ratio.exp()
-        largest = ratio.max()
-        weight = ratio / largest
+        weight = (log_ratio - log_ratio.amax(0)).exp()
         metrics = {
             "clip_fraction": (clipped != log_ratio).to(ratio.dtype).mean(),
             "kl_approx": -log_ratio.mean(),
             "ESS": weight.sum(0).square() / (weight * weight).sum(0) / len(weight),
-            "max_ratio": largest,
+            "max_ratio": ratio.max(),
             "mean_ratio": ratio.mean(),
         }
     return {"loss_objective": objective, "loss_critic": ppo.critic_coeff * error.mean(), **metrics}
@@ -129,7 +128,6 @@ def _native_terms(
         or target.shape != data.shape
         or target.requires_grad
         or advantage.requires_grad
-        or heads_refusal(actor, critic, *given) is not None
     ):
         return None
     low, high = ppo._clip_bounds
@@ -137,6 +135,8 @@ def _native_terms(
         *given, actor, critic, low=float(low), high=float(high),
         scale_floor=float(scale.scale_lb), kind=ppo.loss_critic_type,
     )  # fmt: skip
+    if terms is None:
+        return None
     return {
         "loss_objective": terms.objective,
         "loss_critic": ppo.critic_coeff * terms.error,
@@ -212,8 +212,12 @@ def plain_heads(
     ):
         return None
     head, last = actor.module
+    needed = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target)
+    if any(data.get(key, None) is None for key in needed):
+        return None  # the loss says what is missing
     if (
         not isinstance(head, TensorDictModule)
+        or any(hooked(module) for module in (actor, head, last, critic))
         or last.distribution_class is not IndependentNormal
         or last.distribution_kwargs
         or list(last.in_keys) != ["loc", "scale"]
