@@ -274,6 +274,7 @@ def filter_sequence(
 
     Example:
         >>> import torch
+        >>> from torchrl_drbpn.functional import MeanNetwork
         >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
         >>> eye = torch.eye(2)
         >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
@@ -333,6 +334,7 @@ def filter_followed(
 
     Example:
         >>> import torch
+        >>> from torchrl_drbpn.functional import MeanNetwork
         >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
         >>> eye = torch.eye(2)
         >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
