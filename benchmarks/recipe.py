@@ -12,13 +12,13 @@ from timing import ROOT
 if str(ROOT / "recipes") not in sys.path:
     sys.path.insert(0, str(ROOT / "recipes"))
 
-from assembly.algorithms.ppo import PPO
-from assembly.rollout import add_advantages, minibatches, to_sequences
-from assembly.settings import read_settings
-from assembly.training import Training, assemble, train_rollout
+from algorithms.ppo import PPO
+from training.config import read_settings
+from training.loop import Training, assemble, train_rollout
+from training.rollout import add_advantages, minibatches, to_sequences
 
 if TYPE_CHECKING:
-    from assembly.settings import Settings
+    from training.config import Settings
 
 __all__ = [
     "PPO",

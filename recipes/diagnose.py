@@ -14,10 +14,8 @@ from typing import Any
 
 import hydra
 import torch
-from assembly.belief_figure import save_figure
-from assembly.console import say, start
-from assembly.diagnosis import Tally, class_names, diagnose, pool
-from assembly.diagnosis_figures import (
+from analysis.calibration import Tally, class_names, diagnose, pool
+from analysis.calibration_figures import (
     Series,
     draw_outages,
     outage_figure,
@@ -25,17 +23,19 @@ from assembly.diagnosis_figures import (
     read_outages,
     reliability_figure,
 )
-from assembly.diagnosis_tables import calibration_rows, precision_rows, reliability_rows
-from assembly.errors import UserError
-from assembly.evaluation_grid import parse_points
-from assembly.methods import training_labels
-from assembly.points import Point, check_reduction_seed, removed_sensors
-from assembly.report_page import csv_cells
-from assembly.report_runs import find_folders
-from assembly.run_folder import write_table
-from assembly.settings import check_mode, missingness_name
-from assembly.trained import TrainedAgent, load_trained_agent, with_checkpoint
+from analysis.calibration_tables import calibration_rows, precision_rows, reliability_rows
+from analysis.report_page import csv_cells
+from analysis.report_runs import find_folders
+from evaluation.conditions import Point, check_reduction_seed, removed_sensors
+from evaluation.grid import parse_points
+from evaluation.trained import TrainedAgent, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
+from rendering.belief_figure import save_figure
+from training.config import check_mode, missingness_name
+from training.console import say, start
+from training.errors import UserError
+from training.methods import training_labels
+from training.run_folder import write_table
 
 from torchrl_drbpn import BeliefDivergedError
 

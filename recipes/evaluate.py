@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from assembly.belief_figure import save_figure
-from assembly.console import say, start
-from assembly.errors import UserError
-from assembly.evaluation_grid import (
+from analysis.report_evaluations import GRID_TABLE, POINTS_TABLE
+from analysis.report_runs import find_folders
+from analysis.robustness_figure import draw_robustness, read_rows
+from evaluation.conditions import Point, check_reduction_seed, identity
+from evaluation.grid import (
     Grid,
     Protocol,
     Results,
@@ -26,16 +27,15 @@ from assembly.evaluation_grid import (
     grid_points,
     parse_points,
 )
-from assembly.points import Point, check_reduction_seed, identity
-from assembly.report_evaluations import GRID_TABLE, POINTS_TABLE
-from assembly.report_runs import find_folders
-from assembly.robustness_figure import draw_robustness, read_rows
-from assembly.sensor_choice import kept_sensors
-from assembly.sensor_groups import have_names
-from assembly.sensors import sensor_names
-from assembly.settings import check_mode
-from assembly.trained import TrainedAgent, gated, load_trained_agent, with_checkpoint
+from evaluation.sensor_choice import kept_sensors
+from evaluation.trained import TrainedAgent, gated, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
+from rendering.belief_figure import save_figure
+from training.config import check_mode
+from training.console import say, start
+from training.errors import UserError
+from training.sensor_groups import have_names
+from training.sensors import sensor_names
 
 from torchrl_drbpn.functional.saturation import check_gate
 

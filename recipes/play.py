@@ -13,17 +13,17 @@ from typing import Any
 
 import hydra
 import torch
-from assembly.belief_figure import chosen_sensors
-from assembly.console import say, start
-from assembly.errors import UserError
-from assembly.film import Film, Frame, robot_size
-from assembly.frames import render_or_say
-from assembly.points import check_reduction_seed, parse_point, removed_sensors
-from assembly.recording import Recording, record_episode
-from assembly.settings import check_mode, missingness_name
-from assembly.trained import load_trained_agent
-from assembly.video import check_video, write_video
+from evaluation.conditions import check_reduction_seed, parse_point, removed_sensors
+from evaluation.trained import load_trained_agent
 from omegaconf import DictConfig
+from rendering.belief_figure import chosen_sensors
+from rendering.film import Film, Frame, robot_size
+from rendering.frames import render_or_say
+from rendering.trajectory import Recording, record_episode
+from rendering.video_file import check_video, write_video
+from training.config import check_mode, missingness_name
+from training.console import say, start
+from training.errors import UserError
 
 _WIDTHS = (240, 1920)  # pixels
 _COLOURS = (8, 256)

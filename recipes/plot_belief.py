@@ -13,15 +13,15 @@ from typing import Any
 import hydra
 import numpy as np
 import torch
-from assembly.belief_figure import chosen_sensors, draw_belief, frame_steps, save_figure
-from assembly.console import say, start
-from assembly.errors import UserError
-from assembly.frames import render_or_say
-from assembly.points import read_point
-from assembly.recording import Recording, record_episode
-from assembly.settings import check_mode
-from assembly.trained import load_trained_agent
+from evaluation.conditions import read_point
+from evaluation.trained import load_trained_agent
 from omegaconf import DictConfig
+from rendering.belief_figure import chosen_sensors, draw_belief, frame_steps, save_figure
+from rendering.frames import render_or_say
+from rendering.trajectory import Recording, record_episode
+from training.config import check_mode
+from training.console import say, start
+from training.errors import UserError
 
 _FRAME_HEIGHT = 330  # pixels
 

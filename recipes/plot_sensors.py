@@ -13,16 +13,16 @@ from typing import Any, Literal
 
 import hydra
 import torch
-from assembly.belief_figure import save_figure
-from assembly.console import say, start
-from assembly.errors import UserError
-from assembly.report_runs import find_folders
-from assembly.run_folder import write_table
-from assembly.sensor_choice import SensorModel, learned_sensors
-from assembly.sensor_figures import covariance_figure, ranking_figure
-from assembly.settings import missingness_name
-from assembly.trained import TrainedAgent, load_trained_agent, with_checkpoint
+from analysis.report_runs import find_folders
+from analysis.sensor_figures import covariance_figure, ranking_figure
+from evaluation.sensor_choice import SensorModel, learned_sensors
+from evaluation.trained import TrainedAgent, load_trained_agent, with_checkpoint
 from omegaconf import DictConfig
+from rendering.belief_figure import save_figure
+from training.config import missingness_name
+from training.console import say, start
+from training.errors import UserError
+from training.run_folder import write_table
 
 _Run = tuple[TrainedAgent, SensorModel]
 

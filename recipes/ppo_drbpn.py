@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, cast
 
 import hydra
-from assembly.console import run_or_explain
-from assembly.resume import resumed_config
-from assembly.run import run
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from training.console import run_or_explain
+from training.resume import resumed_config
+from training.run import run
 
 # A resumed run stays in its own folder; see hydra.run.dir in conf/config.yaml.
 OmegaConf.register_new_resolver("run_folder", lambda resume, new: resume or new, replace=True)

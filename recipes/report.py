@@ -18,18 +18,18 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from assembly.belief_figure import save_figure
-from assembly.console import say, start
-from assembly.errors import UserError
-from assembly.report_figures import learning_curves, robustness
-from assembly.report_index import index_page, studies_of
-from assembly.report_options import OPTIONS_FILE, Options, read_options
-from assembly.report_page import Tables, csv_cells, study_page
-from assembly.report_paper import aggregate_rows, efficiency_rows, margin_rows
-from assembly.report_runs import find_folders, read_study, without_rollout
-from assembly.report_tables import evaluation_rows, summary_rows, training_rows
-from assembly.run_folder import write_table, write_whole
+from analysis.report_figures import learning_curves, robustness
+from analysis.report_index import index_page, studies_of
+from analysis.report_options import OPTIONS_FILE, Options, read_options
+from analysis.report_page import Tables, csv_cells, study_page
+from analysis.report_paper import aggregate_rows, efficiency_rows, margin_rows
+from analysis.report_runs import find_folders, read_study, without_rollout
+from analysis.report_tables import evaluation_rows, summary_rows, training_rows
 from omegaconf import DictConfig
+from rendering.belief_figure import save_figure
+from training.console import say, start
+from training.errors import UserError
+from training.run_folder import write_table, write_whole
 
 NOTES_FILE = "notes.md"
 # In this order: the page, which names the others, comes last.

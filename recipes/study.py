@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from assembly.console import start
-from assembly.errors import UserError
-from assembly.study_cells import StudyFolder
-from assembly.study_grid import read_grid
-from assembly.study_job import StudyJob
 from omegaconf import DictConfig
+from studies.cells import StudyFolder
+from studies.grid import read_grid
+from studies.job import StudyJob
+from training.console import start
+from training.errors import UserError
 
 
 def run(config: dict[str, Any]) -> int:

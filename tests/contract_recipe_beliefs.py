@@ -27,13 +27,13 @@ from torchrl_drbpn import (
 )
 
 if TYPE_CHECKING:
-    from assembly.beliefs import Belief
+    from beliefs import Belief
 
 LOG_LIKELIHOOD = ("belief", "log_likelihood")
 
 
 class RecipeBeliefContract(BeliefFrames):
-    """Duties of what a builder under recipes/assembly/beliefs returns.
+    """Duties of what a builder under recipes/beliefs returns.
 
     With or without memory, with or without a model: the recipe gives every belief module the same
     entries and reads `features`; it collects step by step, learns over sequences cut from the
@@ -305,7 +305,7 @@ class RecipeBeliefContract(BeliefFrames):
         check_env_specs(self.make_env(belief))
 
     def test_what_it_tells_of_the_sensors_comes_from_the_same_belief(self):
-        from assembly import beliefs
+        from X import beliefs
 
         belief = self.make_belief()
         if belief.observing is None:

@@ -15,9 +15,9 @@ from recipe_tools import ROOT, make_config  # isort: skip
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 import torch
-from assembly.run import run as train
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from training.run import run as train
 
 SMOKE = (
     "experiment=smoke",

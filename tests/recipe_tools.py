@@ -34,10 +34,10 @@ def make_config(*overrides: str) -> dict[str, Any]:
 
 def make_folder(folder: Path, *overrides: str) -> Path:
     """Leave a run folder with a checkpoint after one rollout with two fifths of it missing."""
-    from assembly.checkpoint import save_checkpoint
-    from assembly.run_folder import write_config
-    from assembly.settings import read_settings
-    from assembly.training import assemble, train_rollout, training_state
+    from training.checkpoint import save_checkpoint
+    from training.config import read_settings
+    from training.loop import assemble, train_rollout, training_state
+    from training.run_folder import write_config
 
     smoke = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
     config = make_config(*smoke, *overrides)

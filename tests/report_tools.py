@@ -13,8 +13,8 @@ pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
 from recipe_tools import make_config  # isort: skip
 
-from assembly.run_folder import EVALUATION_COLUMNS, Table, write_config
 from report import run
+from training.run_folder import EVALUATION_COLUMNS, Table, write_config
 
 ASKED = dict.fromkeys(("run", "out", "index", "title", "rows", "unfinished"))
 FRAMES = [100, 200, 300, 400]

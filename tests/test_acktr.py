@@ -18,17 +18,17 @@ from tensordict import TensorDictBase
 pytest.importorskip("hydra")
 from recipe_tools import differences, make_config, read_table  # isort: skip
 
-from assembly.algorithms import build_algorithm
-from assembly.algorithms.acktr import ACKTR
-from assembly.checkpoint import last_checkpoint, load_checkpoint
-from assembly.errors import UserError
-from assembly.report_commands import training_command
-from assembly.report_runs import read_study
-from assembly.resume import resumed_config
-from assembly.rollout import add_advantages
-from assembly.run import run
-from assembly.settings import read_settings
-from assembly.training import Training, assemble, make_agent, train_rollout
+from algorithms import build_algorithm
+from algorithms.acktr import ACKTR
+from analysis.report_commands import training_command
+from analysis.report_runs import read_study
+from training.checkpoint import last_checkpoint, load_checkpoint
+from training.config import read_settings
+from training.errors import UserError
+from training.loop import Training, assemble, make_agent, train_rollout
+from training.resume import resumed_config
+from training.rollout import add_advantages
+from training.run import run
 
 SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.steps=3")
 
@@ -152,7 +152,7 @@ def test_a_belief_with_weights_of_its_own_is_refused(belief: str) -> None:
 @pytest.mark.parametrize(
     ("override", "line"),
     [
-        ("algo._target_=assembly.nowhere.build", "`algo._target_` must name a builder such as"),
+        ("algo._target_=nowhere.build", "`algo._target_` must name a builder such as"),
         ("+algo.colour=red", "`algo=acktr`: .*colour"),
         ("algo.desired_kl=0", "`algo=acktr`: `desired_kl` must be positive"),
         ("algo.policy.damping=0", "`algo=acktr`: `damping` must be positive, got 0"),

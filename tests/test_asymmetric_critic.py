@@ -32,8 +32,8 @@ CORRUPTION = {
 
 
 def assemble(*overrides: str):
-    from assembly.settings import read_settings
-    from assembly.training import assemble as assembled
+    from training.config import read_settings
+    from training.loop import assemble as assembled
 
     settings = read_settings(make_config(*SMOKE, *overrides))
     return assembled(settings), settings
@@ -51,7 +51,7 @@ def rollout(belief: str):
 
 
 def with_advantages(belief: str):
-    from assembly.rollout import add_advantages
+    from training.rollout import add_advantages
 
     training, data = rollout(belief)
     data = data.clone()
@@ -67,8 +67,8 @@ def raw(env: TransformedEnv, data: TensorDictBase, key: str) -> torch.Tensor:
 
 @pytest.mark.parametrize("corruption", CORRUPTION.values(), ids=CORRUPTION)
 def test_the_complete_observation_is_what_complete_noiseless_sensors_show(corruption):
-    from assembly.environment import make_environment
-    from assembly.settings import read_settings
+    from training.config import read_settings
+    from training.envs import make_environment
 
     def make(*overrides, complete):
         s = read_settings(make_config(*SMOKE, *overrides))
@@ -100,8 +100,8 @@ def test_the_complete_observation_is_what_complete_noiseless_sensors_show(corrup
 
 
 def test_by_default_nothing_complete_is_written():
-    from assembly.settings import read_settings
-    from assembly.training import assemble as assembled
+    from training.config import read_settings
+    from training.loop import assemble as assembled
 
     with torch.random.fork_rng():
         training = assembled(read_settings(make_config("experiment=smoke")))
@@ -127,7 +127,7 @@ def test_the_critic_reads_it_and_the_policy_does_not(belief):
 
 @pytest.mark.parametrize("belief", BELIEFS)
 def test_the_values_of_the_advantages_are_those_of_the_complete_observations(belief):
-    from assembly.rollout import recompute_advantages
+    from training.rollout import recompute_advantages
 
     training, data = with_advantages(belief)
     critic = training.agent.critic.module
@@ -152,8 +152,8 @@ def test_the_values_of_the_advantages_are_those_of_the_complete_observations(bel
 
 @pytest.mark.parametrize("belief", BELIEFS)
 def test_every_belief_trains_with_it(belief):
-    from assembly.rollout import to_sequences
-    from assembly.training import train_rollout
+    from training.loop import train_rollout
+    from training.rollout import to_sequences
 
     training, data = with_advantages(belief)
     out = training.algorithm.loss(to_sequences(data, training.algorithm.loss, 16))
@@ -173,7 +173,7 @@ def test_every_belief_trains_with_it(belief):
 
 # ------------------------------------------------------------------------------ files
 def test_a_stopped_run_goes_on_to_the_last_bit():
-    from assembly.training import restore, train_rollout, training_state
+    from training.loop import restore, train_rollout, training_state
 
     with torch.random.fork_rng():
         whole, settings = assemble()
@@ -190,9 +190,9 @@ def test_a_stopped_run_goes_on_to_the_last_bit():
 
 
 def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path: Path):
-    from assembly.evaluation import evaluate, make_evaluation_environment
-    from assembly.run import run
-    from assembly.trained import load_trained_agent
+    from evaluation.episodes import evaluate, make_evaluation_environment
+    from evaluation.trained import load_trained_agent
+    from training.run import run
 
     with torch.random.fork_rng():
         assert run(make_config(*SMOKE, "total_frames=128"), tmp_path / "run") == 0

@@ -17,7 +17,7 @@ OBS, ACTION, TIME = 5, 2, 7
 
 
 def make_belief(name: str):
-    from assembly.beliefs import build_belief
+    from beliefs import build_belief
 
     config = recipe_tools.make_config(*f"belief={name}".split())
     torch.manual_seed(0)
@@ -68,15 +68,15 @@ def test_only_gru_action_reads_the_action():
 
 
 def test_a_wrong_cell_is_named():
-    from assembly.errors import UserError
+    from training.errors import UserError
 
     with pytest.raises(UserError, match="`cell` must be 'gru' or 'lstm', got 'rnn'"):
         make_belief("gru belief.cell=rnn")
 
 
 def test_filling_holds_the_last_normalised_value_and_the_mean_before_the_first():
-    from assembly.settings import read_settings
-    from assembly.training import assemble
+    from training.config import read_settings
+    from training.loop import assemble
 
     with torch.random.fork_rng():
         config = recipe_tools.make_config("experiment=smoke", "belief=fill", "missingness=mcar")

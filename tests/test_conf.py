@@ -18,14 +18,14 @@ ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
 sys.path.insert(0, str(ROOT / "recipes"))
 
-from assembly.beliefs import build_belief  # noqa: E402
-from assembly.environment import task_dims  # noqa: E402
-from assembly.errors import UserError  # noqa: E402
-from assembly.resume import resumed_config  # noqa: E402
-from assembly.run_folder import read_config, write_config  # noqa: E402
-from assembly.settings import EnvSettings, read_settings  # noqa: E402
+from beliefs import build_belief  # noqa: E402
 from hydra import compose, initialize_config_dir  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
+from training.config import EnvSettings, read_settings  # noqa: E402
+from training.envs import task_dims  # noqa: E402
+from training.errors import UserError  # noqa: E402
+from training.resume import resumed_config  # noqa: E402
+from training.run_folder import read_config, write_config  # noqa: E402
 
 CHOICES = sorted(
     (path.parent.name, path.stem)
@@ -138,7 +138,7 @@ def test_a_bad_value_is_refused_in_one_line(override: str, line: str) -> None:
     [
         (["belief.state_dim=0"], "`state_dim` must be an int of at least 1, got 0"),
         (["belief.policy_input=guess"], "`policy_input` must be 'mean' or 'mean_cov'"),
-        (["belief._target_=assembly.nowhere.build"], "`belief._target_` must name a builder"),
+        (["belief._target_=nowhere.build"], "`belief._target_` must name a builder"),
         (["belief.emission.min_std=1.0"], "`min_std` and `init_std` must satisfy"),
         (["+belief.colour=red"], "`belief=drbpn`: .*colour"),
     ],

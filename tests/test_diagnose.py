@@ -23,27 +23,27 @@ pytest.importorskip("matplotlib")
 from recipe_tools import make_config  # isort: skip
 
 import diagnose
-from assembly import diagnosis
-from assembly.beliefs import ESTIMATE, FORECAST, FORECAST_COV
-from assembly.checkpoint import save_checkpoint
-from assembly.diagnosis import Forecast, Tally, class_names, pool
-from assembly.diagnosis_figures import Series, draw_outages, outage_figure, read_outages
-from assembly.diagnosis_tables import (
+from analysis import calibration as diagnosis
+from analysis.calibration import Forecast, Tally, class_names, pool
+from analysis.calibration_figures import Series, draw_outages, outage_figure, read_outages
+from analysis.calibration_tables import (
     Resampling,
     calibration_rows,
     precision_rows,
     reliability_rows,
 )
-from assembly.environment import copy_statistics
-from assembly.errors import UserError
-from assembly.evaluation import make_evaluation_environment
-from assembly.report_page import csv_cells
-from assembly.run_folder import write_config, write_table
-from assembly.settings import read_settings
-from assembly.trained import TrainedAgent, load_trained_agent
-from assembly.training import assemble, train_rollout, training_state
+from analysis.report_page import csv_cells
+from beliefs import ESTIMATE, FORECAST, FORECAST_COV
+from evaluation.episodes import make_evaluation_environment
+from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from training.checkpoint import save_checkpoint
+from training.config import read_settings
+from training.envs import copy_statistics
+from training.errors import UserError
+from training.loop import assemble, train_rollout, training_state
+from training.run_folder import write_config, write_table
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
 BINS = [1, 2, 3, 6]

@@ -19,17 +19,17 @@ pytest.importorskip("matplotlib")
 from evaluation_tools import SMOKE, evaluate, trained_folder  # isort: skip
 
 import diagnose as diagnose_recipe
-from assembly import evaluation_grid
-from assembly.console import run_or_explain
-from assembly.diagnosis import diagnose
-from assembly.errors import UserError
-from assembly.evaluation_grid import agent_of, evaluate_tasks
-from assembly.points import parse_point
-from assembly.run_folder import write_table
-from assembly.settings import Settings, read_settings
-from assembly.trained import TrainedAgent, load_trained_agent
+from analysis.calibration import diagnose
+from evaluation import grid as evaluation_grid
+from evaluation.conditions import parse_point
+from evaluation.grid import agent_of, evaluate_tasks
+from evaluation.trained import TrainedAgent, load_trained_agent
 from recipe_tools import make_config
 from report_tools import make_run, report
+from training.config import Settings, read_settings
+from training.console import run_or_explain
+from training.errors import UserError
+from training.run_folder import write_table
 
 from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
 

@@ -27,17 +27,17 @@ from recipe_tools import ROOT, make_config  # isort: skip
 
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
-from assembly import evaluation_grid
-from assembly.errors import UserError
-from assembly.evaluation import Episodes
-from assembly.evaluation_grid import Grid, evaluate_tasks, grid_points
-from assembly.points import Point, evaluate_points, parse_point, removed_sensors
-from assembly.robustness_figure import draw_robustness, mean_interval, read_rows
-from assembly.sensor_choice import kept_sensors
-from assembly.sensor_groups import sensor_groups
-from assembly.sensors import named_tasks, sensor_names
-from assembly.settings import Settings, read_settings
-from assembly.trained import TrainedAgent, load_trained_agent
+from analysis.robustness_figure import draw_robustness, mean_interval, read_rows
+from evaluation import grid as evaluation_grid
+from evaluation.conditions import Point, evaluate_points, parse_point, removed_sensors
+from evaluation.episodes import Episodes
+from evaluation.grid import Grid, evaluate_tasks, grid_points
+from evaluation.sensor_choice import kept_sensors
+from evaluation.trained import TrainedAgent, load_trained_agent
+from training.config import Settings, read_settings
+from training.errors import UserError
+from training.sensor_groups import sensor_groups
+from training.sensors import named_tasks, sensor_names
 
 from torchrl_drbpn.functional import draw_mechanism
 

@@ -18,7 +18,7 @@ import recipe_tools  # isort: skip  # noqa: F401  (puts the recipes on the path)
 
 import itertools
 
-from assembly.algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
+from algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
 
 N = 40
 NUMBERS = {"lr": 1.0, "momentum": 0.0, "damping": 1e-12, "decay": 0.9, "max_kl": 1e9}

@@ -17,11 +17,11 @@ pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
 from recipe_tools import BELIEFS, ROOT, make_config  # isort: skip
 
-from assembly.errors import UserError
-from assembly.methods import method_label, method_name, read_cell, training_labels
-from assembly.robustness_figure import draw_robustness, read_rows
-from assembly.run_folder import read_config
-from assembly.settings import read_settings
+from analysis.robustness_figure import draw_robustness, read_rows
+from training.config import read_settings
+from training.errors import UserError
+from training.methods import method_label, method_name, read_cell, training_labels
+from training.run_folder import read_config
 
 
 def named(*overrides: str) -> str:

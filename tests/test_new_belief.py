@@ -36,8 +36,8 @@ def command_of_the_page() -> tuple[dict[str, str], list[str]]:
 
 
 def test_the_command_of_the_page_trains_it_from_anywhere(tmp_path: Path) -> None:
-    from assembly.evaluation import evaluate, make_evaluation_environment
-    from assembly.trained import load_trained_agent
+    from evaluation.episodes import evaluate, make_evaluation_environment
+    from evaluation.trained import load_trained_agent
 
     extra, words = command_of_the_page()
     done = subprocess.run(

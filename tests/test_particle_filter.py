@@ -261,7 +261,7 @@ def test_the_recipe_builds_it_with_the_settings_of_conf():
 
     root = Path(__file__).parents[1]
     sys.path.insert(0, str(root / "recipes"))
-    from assembly.beliefs import build_belief
+    from beliefs import build_belief
 
     settings = OmegaConf.to_container(OmegaConf.load(root / "conf" / "belief" / "dvrl.yaml"))
     belief = build_belief(settings, obs_dim=11, action_dim=3, normalize="entry")

@@ -24,15 +24,15 @@ pytest.importorskip("matplotlib")
 from recipe_tools import make_folder  # isort: skip
 
 import play
-from assembly import frames
-from assembly.belief_figure import ABSENT, BELIEF, MISSING
-from assembly.errors import UserError
-from assembly.film import Film, robot_size
-from assembly.points import parse_point
-from assembly.recording import Recording, record_episode
-from assembly.trained import load_trained_agent
-from assembly.video import write_video
+from evaluation.conditions import parse_point
+from evaluation.trained import load_trained_agent
 from omegaconf import OmegaConf
+from rendering import frames
+from rendering.belief_figure import ABSENT, BELIEF, MISSING
+from rendering.film import Film, robot_size
+from rendering.trajectory import Recording, record_episode
+from rendering.video_file import write_video
+from training.errors import UserError
 
 CONF = Path(__file__).parents[1] / "conf" / "play.yaml"
 # Small, and without the robot: rendering needs what a machine may lack.

@@ -20,15 +20,15 @@ pytest.importorskip("matplotlib")
 from recipe_tools import make_config, make_folder  # isort: skip
 
 import plot_belief
-from assembly import frames
-from assembly.belief_figure import draw_belief, frame_steps, most_missing, save_figure
-from assembly.errors import UserError
-from assembly.frames import render_poses
-from assembly.points import read_point
-from assembly.recording import Recording, record_episode
-from assembly.sensors import named_tasks, sensor_names
-from assembly.trained import load_trained_agent
+from evaluation.conditions import read_point
+from evaluation.trained import load_trained_agent
 from matplotlib.image import imread
+from rendering import frames
+from rendering.belief_figure import draw_belief, frame_steps, most_missing, save_figure
+from rendering.frames import render_poses
+from rendering.trajectory import Recording, record_episode
+from training.errors import UserError
+from training.sensors import named_tasks, sensor_names
 
 DEFAULTS = {"mode": "sampled", "start": 0, "steps": 12, "sensors": 2, "frames": 0, "seed": 4}
 

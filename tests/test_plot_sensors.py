@@ -25,11 +25,11 @@ pytest.importorskip("matplotlib")
 from recipe_tools import ROOT  # isort: skip
 
 import plot_sensors
-from assembly.errors import UserError
-from assembly.sensor_choice import SensorModel, kept_sensors, learned_sensors
-from assembly.sensor_figures import place_of_sensors, random_orders
-from assembly.trained import TrainedAgent, load_trained_agent
+from analysis.sensor_figures import place_of_sensors, random_orders
+from evaluation.sensor_choice import SensorModel, kept_sensors, learned_sensors
+from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.image import imread
+from training.errors import UserError
 
 from torchrl_drbpn import (
     BeliefFilterModule,

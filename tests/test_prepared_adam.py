@@ -32,7 +32,7 @@ def set_gradients(parameters: list[nn.Parameter], step: int) -> None:
 
 
 def take(parameters, optimizer, steps, prepared: bool) -> None:
-    from assembly.algorithms.prepared import PreparedAdam
+    from algorithms.prepared import PreparedAdam
 
     fast = None
     for step in steps:
@@ -78,7 +78,7 @@ def test_a_state_written_after_prepared_steps_is_taken_up(prepared):
 
 
 def test_other_parameters_with_a_gradient_are_left_to_the_optimiser():
-    from assembly.algorithms.prepared import PreparedAdam
+    from algorithms.prepared import PreparedAdam
 
     parameters, optimizer = make()
     set_gradients(parameters, 0)

@@ -26,17 +26,17 @@ import torch
 pytest.importorskip("hydra")
 from recipe_tools import ROOT, differences, make_config, read_table  # isort: skip
 
-from assembly import run_folder
-from assembly.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
-from assembly.errors import UserError
-from assembly.evaluation import evaluate, make_evaluation_environment
-from assembly.points import episode_rows, evaluate_points, parse_point, read_point
-from assembly.resume import resumed_config
-from assembly.run import run
-from assembly.run_folder import Table, read_config
-from assembly.settings import read_settings
-from assembly.trained import load_trained_agent
-from assembly.training import assemble, restore, train_rollout, training_state
+from evaluation.conditions import episode_rows, evaluate_points, parse_point, read_point
+from evaluation.episodes import evaluate, make_evaluation_environment
+from evaluation.trained import load_trained_agent
+from training import run_folder
+from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
+from training.config import read_settings
+from training.errors import UserError
+from training.loop import assemble, restore, train_rollout, training_state
+from training.resume import resumed_config
+from training.run import run
+from training.run_folder import Table, read_config
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.2")
 

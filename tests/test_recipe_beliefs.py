@@ -18,10 +18,10 @@ from contracts import ACTION, OBS, RecipeBeliefContract, saved
 pytest.importorskip("hydra")
 from recipe_tools import BELIEFS, differences, make_config  # isort: skip
 
-from assembly.beliefs import Belief, build_belief
-from assembly.errors import UserError
-from assembly.settings import read_settings
-from assembly.training import (
+from beliefs import Belief, build_belief
+from training.config import read_settings
+from training.errors import UserError
+from training.loop import (
     assemble,
     metric_columns,
     restore,

@@ -20,12 +20,12 @@ pytest.importorskip(
 )
 from recipe_tools import differences, make_config, read_table  # isort: skip
 
-from assembly.checkpoint import last_checkpoint, load_checkpoint
-from assembly.errors import UserError
-from assembly.resume import resumed_config
-from assembly.run import run
-from assembly.settings import read_settings
-from assembly.training import assemble, restore, train_rollout, training_state
+from training.checkpoint import last_checkpoint, load_checkpoint
+from training.config import read_settings
+from training.errors import UserError
+from training.loop import assemble, restore, train_rollout, training_state
+from training.resume import resumed_config
+from training.run import run
 
 SMOKE = (
     "experiment=smoke",

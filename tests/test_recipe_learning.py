@@ -14,7 +14,7 @@ import torch
 pytest.importorskip("hydra")
 from recipe_tools import make_config, read_table  # isort: skip
 
-from assembly.run import run
+from training.run import run
 
 
 def improvement(folder: Path, *overrides: str) -> float:

@@ -16,15 +16,15 @@ SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.5")
 
 
 def assemble(*overrides: str):
-    from assembly.settings import read_settings
-    from assembly.training import assemble as assembled
+    from training.config import read_settings
+    from training.loop import assemble as assembled
 
     settings = read_settings(make_config(*SMOKE, *overrides))
     return assembled(settings), settings
 
 
 def collected(*overrides: str):
-    from assembly.rollout import add_advantages
+    from training.rollout import add_advantages
 
     with torch.random.fork_rng():
         training, _ = assemble(*overrides)
@@ -43,7 +43,7 @@ def move_critic(training) -> None:
 # A particle filter draws anew at every pass: its beliefs are not repeated by a second step.
 @pytest.mark.parametrize("belief", [b for b in BELIEFS if b != "dvrl"])
 def test_the_parameters_that_collected_give_the_advantages_that_were_there(belief):
-    from assembly.rollout import recompute_advantages
+    from training.rollout import recompute_advantages
 
     training, data = collected(f"belief={belief}")
     before = data["advantage"].clone()
@@ -53,8 +53,8 @@ def test_the_parameters_that_collected_give_the_advantages_that_were_there(belie
 
 
 def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
-    from assembly.rollout import recompute_advantages
     from torchrl.objectives.value import GAE
+    from training.rollout import recompute_advantages
 
     training, data = collected("belief=none")
     stale = data["advantage"].clone()
@@ -71,7 +71,7 @@ def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
 
 
 def losses(recompute: bool, epochs: int) -> dict[str, float]:
-    from assembly.training import train_rollout
+    from training.loop import train_rollout
 
     with torch.random.fork_rng():
         flag = f"optim.recompute_advantages={str(recompute).lower()}"

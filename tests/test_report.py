@@ -22,15 +22,15 @@ pytest.importorskip("matplotlib")
 from recipe_tools import ROOT, make_config  # isort: skip
 from report_tools import ASKED, VERSIONS, make_run, quantity, report, table  # isort: skip
 
-from assembly.errors import UserError
-from assembly.report_commands import training_command
-from assembly.report_evaluations import point_kind, point_order
-from assembly.report_index import index_page, studies_of
-from assembly.report_paper import steps_to_threshold, top_return
-from assembly.report_runs import StudyRun, find_folders, flat, read_study
-from assembly.report_tables import format_number
-from assembly.run_folder import Table, write_table
+from analysis.report_commands import training_command
+from analysis.report_evaluations import point_kind, point_order
+from analysis.report_index import index_page, studies_of
+from analysis.report_paper import steps_to_threshold, top_return
+from analysis.report_runs import StudyRun, find_folders, flat, read_study
+from analysis.report_tables import format_number
 from report import run
+from training.errors import UserError
+from training.run_folder import Table, write_table
 
 COMMITTED = sorted(path.parent for path in (ROOT / "results").glob("*/runs"))
 

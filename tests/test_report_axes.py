@@ -8,8 +8,8 @@ from typing import Any
 # Puts recipes/ on the path, so it comes first.
 from report_tools import make_run, quantity, report, table  # isort: skip
 
-from assembly.report_cells import margin
-from assembly.report_variants import mark_best
+from analysis.report_cells import margin
+from analysis.report_variants import mark_best
 
 
 def test_an_axis_of_its_own_gets_a_table_with_the_best_of_each_line(tmp_path: Path) -> None:

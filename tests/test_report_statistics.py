@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import recipe_tools  # noqa: F401  (puts recipes/ on the path)
-from assembly.report_statistics import interquartile_mean, interval
+from analysis.report_statistics import interquartile_mean, interval
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side() -> None:

@@ -17,10 +17,10 @@ from torchrl.envs import ExplorationType, set_exploration_type
 pytest.importorskip("hydra")
 from recipe_tools import make_config  # isort: skip
 
-from assembly import decision
-from assembly.decision import RolloutPolicy
-from assembly.settings import read_settings
-from assembly.training import Training, assemble
+from training import decision
+from training.config import read_settings
+from training.decision import RolloutPolicy
+from training.loop import Training, assemble
 
 from torchrl_drbpn.functional import native_error
 

@@ -26,14 +26,14 @@ import yaml
 pytest.importorskip("hydra")
 from recipe_tools import ROOT, make_config, read_table  # isort: skip
 
-from assembly.checkpoint import checkpoint_frames
-from assembly.errors import UserError
-from assembly.run_folder import write_config
-from assembly.study_cells import StudyFolder
-from assembly.study_grid import Cell, read_grid
-from assembly.study_job import StudyJob
-from assembly.study_status import duration, expected_speeds, seconds_left
 from omegaconf import OmegaConf
+from studies.cells import StudyFolder
+from studies.grid import Cell, read_grid
+from studies.job import StudyJob
+from studies.status import duration, expected_speeds, seconds_left
+from training.checkpoint import checkpoint_frames
+from training.errors import UserError
+from training.run_folder import write_config
 
 STUDIES = sorted((ROOT / "conf" / "study").glob("*.yaml"), key=lambda path: path.stem)
 # One process starts in seconds; the run itself then takes little more.

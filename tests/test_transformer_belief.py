@@ -20,7 +20,7 @@ MEMORY, LENGTH = ("recurrent", "memory"), ("recurrent", "length")
 
 def make_module(**sizes: int):
     """Return a transformer in float64."""
-    from assembly.beliefs import build_belief
+    from beliefs import build_belief
 
     settings = recipe_tools.make_config("belief=transformer")["belief"]
     settings |= {"window": 4, "width": 16, "layers": 1, **sizes}
@@ -84,7 +84,7 @@ def band(time: int, steps: int) -> Tensor:
 
 # --- attention
 def test_attention_is_that_of_torch_with_positions_added_to_the_keys():
-    from assembly.beliefs.transformer import MemoryAttention
+    from beliefs.transformer import MemoryAttention
 
     rows, time, window, width, heads = 3, 4, 5, 12, 3
     entries = window - 1 + time
@@ -257,7 +257,7 @@ def test_it_learns_to_repeat_what_arrived_some_steps_ago():
     "sizes", [{"window": 0}, {"layers": 0}, {"heads": 0}, {"width": 0}, {"heads": 3}]
 )
 def test_sizes_that_do_not_fit_are_named(sizes):
-    from assembly.errors import UserError
+    from training.errors import UserError
 
     with pytest.raises(UserError, match="`belief=transformer`: `window`, `width`, `layers` and"):
         make_module(**sizes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from assembly.beliefs import Belief
+from beliefs import Belief
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torchrl.data import Unbounded

@@ -1,1 +1,0 @@
-"""Parts of the recipes: one job each, plain arguments, no Hydra."""

@@ -1,0 +1,130 @@
+"""The deep recurrent belief propagation network as the belief module of a recipe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+
+from beliefs import (
+    ESTIMATE,
+    ESTIMATE_VARIANCE,
+    FORECAST,
+    FORECAST_COV,
+    NOISE_VARIANCE,
+    Belief,
+)
+from torchrl_drbpn import (
+    BeliefFilter,
+    BeliefFilterModule,
+    BeliefModelLoss,
+    GaussianTransition,
+    LinearGaussianEmission,
+)
+
+
+class SensorVariances(nn.Module):
+    """Turn the covariance of the state into variances of the sensors.
+
+    Args:
+        emission: of the filter.
+    """
+
+    def __init__(self, emission: LinearGaussianEmission) -> None:
+        super().__init__()
+        self.emission = emission
+
+    def forward(self, cov: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the diagonals of H P H' and of R.
+
+        Args:
+            cov: P, shape ``(*, state, state)``.
+
+        Returns:
+            Two tensors of shape ``(*, obs)``.
+        """
+        H = self.emission.matrix
+        variance = ((H @ cov) * H).sum(-1)
+        return variance, self.emission.cov().diagonal().expand_as(variance)
+
+
+def observing(module: BeliefFilterModule) -> TensorDictSequential:
+    """Make the filter write everything that it knows of the sensors.
+
+    Args:
+        module: the filter as the agent uses it.
+
+    Returns:
+        A module with the same weights; see :mod:`beliefs`.
+    """
+    cov = ("belief", "cov")
+    wanted = ["features", ("belief", "mean"), ("belief", "log_likelihood"), cov]
+    wanted += [ESTIMATE, FORECAST, FORECAST_COV]
+    filtering = BeliefFilterModule(
+        module.filter, policy_input=module.policy_input, out_keys=wanted, gate=module.gate
+    )
+    variances = TensorDictModule(
+        SensorVariances(module.filter.emission),
+        in_keys=[cov],
+        out_keys=[ESTIMATE_VARIANCE, NOISE_VARIANCE],
+    )
+    return TensorDictSequential(filtering, variances)
+
+
+def build(
+    *,
+    obs_dim: int,
+    action_dim: int,
+    normalize: Literal["entry", "step"],
+    state_dim: int | None,
+    policy_input: Literal["mean", "mean_cov"],
+    transition: Mapping[str, Any],
+    emission: Mapping[str, Any],
+    initial: Mapping[str, Any],
+) -> Belief:
+    """Build the belief filter.
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+        normalize: what the likelihood is divided by, ``entry`` or ``step``.
+        state_dim: components of the latent state; None: as many as the observation, at most 32.
+        policy_input: what the heads read, ``mean`` or ``mean_cov``.
+        transition: arguments of ``GaussianTransition``; ``residual`` None: where state <= obs.
+        emission: arguments of ``LinearGaussianEmission``.
+        initial: arguments of the belief before the first observation.
+
+    Returns:
+        The belief.
+    """
+    state = min(obs_dim, 32) if state_dim is None else state_dim
+    moves = dict(transition)
+    if moves["residual"] is None:
+        # Directions that no sensor sees become integrators under a residual transition.
+        moves["residual"] = state <= obs_dim
+    belief_filter = BeliefFilter(
+        obs_dim,
+        action_dim,
+        state,
+        transition=GaussianTransition(state, action_dim, **moves),
+        emission=LinearGaussianEmission(obs_dim, state, action_dim, **emission),
+        **initial,
+    )
+    module = BeliefFilterModule(belief_filter, policy_input=policy_input)
+
+    def summary() -> dict[str, float]:
+        with torch.no_grad():
+            std = belief_filter.emission.cov().diagonal().sqrt()
+        return {"emission_noise_std": std.mean().item()}
+
+    covariance = state * (state + 1) // 2 if policy_input == "mean_cov" else 0
+    return Belief(
+        module,
+        state + covariance,
+        BeliefModelLoss(normalize=normalize),
+        summary=summary,
+        observing=lambda: observing(module),
+    )

@@ -1,0 +1,54 @@
+"""No belief: the heads read the observation as it arrived."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from beliefs import Belief
+
+
+class ObservationFeatures(nn.Module):
+    """Hand on what arrived; a missing entry is 0, the running mean.
+
+    Args:
+        with_mask: whether to append which entries arrived.
+    """
+
+    def __init__(self, with_mask: bool) -> None:
+        super().__init__()
+        self.with_mask = with_mask
+
+    def forward(self, observation: Tensor, observed: Tensor) -> Tensor:
+        """Return the features.
+
+        Args:
+            observation: shape ``(*, obs)``, normalised; 0 where nothing arrived.
+            observed: bool of the same shape.
+
+        Returns:
+            Features, shape ``(*, obs)`` or ``(*, 2 * obs)``.
+        """
+        if self.with_mask:
+            return torch.cat([observation, observed.to(observation.dtype)], -1)
+        return observation
+
+
+def build(*, obs_dim: int, action_dim: int, normalize: str, with_mask: bool) -> Belief:
+    """Build the absence of a belief.
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action; unused.
+        normalize: unused, there is no model.
+        with_mask: whether the heads also read which entries arrived.
+
+    Returns:
+        The belief.
+    """
+    del action_dim, normalize
+    module = TensorDictModule(
+        ObservationFeatures(with_mask), in_keys=["observation", "observed"], out_keys=["features"]
+    )
+    return Belief(module, obs_dim * (2 if with_mask else 1))

@@ -1,0 +1,123 @@
+"""The auxiliary task of the networks without a model: foresee the next observation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from beliefs import FORECAST, FORECAST_COV
+from torchrl_drbpn.functional import inverse_softplus, positive_std, zero_missing
+
+
+class Foresight(nn.Module):
+    r"""Say how likely what arrived was, given the hidden state before it.
+
+    .. math:: \log N(x_t^{obs}; g(h_{t-1}, a_{t-1}), \mathrm{diag}(\sigma^2))
+
+    Args:
+        hidden_size: width of the hidden state.
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+        init_std: sigma at the start, normalised observation units.
+        min_std: its floor.
+    """
+
+    def __init__(
+        self, hidden_size: int, obs_dim: int, action_dim: int, *, init_std: float, min_std: float
+    ) -> None:
+        super().__init__()
+        self.min_std = min_std
+        self.mean = nn.Sequential(
+            nn.Linear(hidden_size + action_dim, hidden_size),
+            nn.Tanh(),
+            nn.Linear(hidden_size, obs_dim),
+        )
+        self.raw_std = nn.Parameter(inverse_softplus(torch.full((obs_dim,), init_std - min_std)))
+
+    def forward(self, hidden: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Return the log-likelihood of what arrived, as foreseen from the step before.
+
+        Args:
+            hidden: hidden state before the step, shape ``(*, hidden)``.
+            tensordict: with ``observation``, ``observed`` and ``previous_action``.
+
+        Returns:
+            Shape ``(*,)``, nats; 0 where nothing arrived.
+        """
+        observed = tensordict.get("observed")
+        seen = zero_missing(tensordict.get("observation"), observed)
+        mean, std = self.foresee(hidden, tensordict.get("previous_action"))
+        normal = torch.distributions.Normal(mean, std, validate_args=False)
+        density = normal.log_prob(seen)  # type: ignore[no-untyped-call]
+        return zero_missing(density, observed).sum(-1)
+
+    def foresee(self, hidden: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of the next observation.
+
+        Args:
+            hidden: hidden state before the step, shape ``(*, hidden)``.
+            previous_action: shape ``(*, action)``.
+
+        Returns:
+            g, shape ``(*, obs)``, and sigma, shape ``(obs,)``, normalised observation units.
+        """
+        mean = self.mean(torch.cat([hidden, previous_action], -1))
+        return mean, positive_std(self.raw_std, self.min_std)
+
+
+class Foreseen(nn.Module):
+    """Say what is foreseen from a stored state, one step at a time.
+
+    Args:
+        foresight: the auxiliary task.
+        hidden_of: picks the hidden state, shape ``(*, hidden)``, out of the stored one.
+    """
+
+    def __init__(self, foresight: Foresight, hidden_of: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.foresight, self.hidden_of = foresight, hidden_of
+
+    def forward(self, state: Tensor, action: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the forecast and its covariance.
+
+        Args:
+            state: recurrent state before the step.
+            action: the one before, shape ``(*, action)``.
+            is_init: bool, shape ``(*, 1)``: an episode starts from zeros.
+
+        Returns:
+            Shapes ``(*, obs)`` and ``(*, obs, obs)``.
+        """
+        hidden = torch.where(is_init, 0.0, self.hidden_of(state))
+        mean, std = self.foresight.foresee(hidden, action)
+        return mean, torch.diag_embed(std.square().expand_as(mean))
+
+
+def foreseeing(
+    module: TensorDictModuleBase,
+    foresight: Foresight,
+    state_key: NestedKey,
+    hidden_of: Callable[[Tensor], Tensor],
+) -> TensorDictSequential:
+    """Make a recurrent belief write what it foresees, before it looks.
+
+    Args:
+        module: the belief as the agent uses it.
+        foresight: its auxiliary task.
+        state_key: where its recurrent state is read.
+        hidden_of: picks the hidden state out of that.
+
+    Returns:
+        A module with the same weights; see :mod:`beliefs`.
+    """
+    foreseen = TensorDictModule(
+        Foreseen(foresight, hidden_of),
+        in_keys=[state_key, "previous_action", "is_init"],
+        out_keys=[FORECAST, FORECAST_COV],
+    )
+    return TensorDictSequential(foreseen, module)

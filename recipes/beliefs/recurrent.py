@@ -1,0 +1,160 @@
+"""Recurrent networks as belief modules: TorchRL's GRUModule or LSTMModule (DR-PPO, ADR-PPO)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl.modules import GRUModule, LSTMModule
+
+from beliefs import Belief
+from beliefs.prediction_head import Foresight, foreseeing
+from torchrl_drbpn import BeliefModelLoss
+
+_INPUT, _STATE, _STATE_C = "recurrent_input", "recurrent_state", "recurrent_state_c"
+
+
+class RecurrentBelief(TensorDictModuleBase):
+    r"""Run a recurrent network over (what arrived, which entries did[, previous action]).
+
+    Its auxiliary task, the paper's for DR-PPO and ADR-PPO, is to foresee the next observation:
+    see :class:`~beliefs.prediction_head.Foresight`.
+
+    .. math:: h_t = \mathrm{RNN}(h_{t-1}, [x_t, m_t, a_{t-1}])
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+        cell: "gru" or "lstm".
+        hidden_size: width of the hidden state, which is also the features.
+        with_action: whether the network reads the previous action (ADR-PPO).
+        init_std: sigma at the start, normalised observation units.
+        min_std: floor of sigma, normalised observation units.
+
+    Raises:
+        ValueError: for an unknown cell or a width under 1.
+    """
+
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        *,
+        cell: Literal["gru", "lstm"],
+        hidden_size: int,
+        with_action: bool,
+        init_std: float,
+        min_std: float,
+    ) -> None:
+        super().__init__()
+        if cell not in ("gru", "lstm"):
+            raise ValueError(f"`cell` must be 'gru' or 'lstm', got {cell!r}.")
+        if hidden_size < 1:
+            raise ValueError(f"`hidden_size` must be at least 1, got {hidden_size}.")
+        self.with_action = with_action
+        width = 2 * obs_dim + (action_dim if with_action else 0)
+        states = [_STATE] if cell == "gru" else [_STATE, _STATE_C]
+        self.memory = (GRUModule if cell == "gru" else LSTMModule)(
+            input_size=width,
+            hidden_size=hidden_size,
+            in_keys=[_INPUT, *states],
+            out_keys=["features", *(("next", key) for key in states)],
+        )
+        self.foresight = Foresight(
+            hidden_size, obs_dim, action_dim, init_std=init_std, min_std=min_std
+        )
+        self.in_keys = ["observation", "observed", "previous_action", "is_init", *states]
+        self.out_keys = ["features", ("belief", "log_likelihood"), *self.memory.out_keys[1:]]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write features, log-likelihood and the next hidden state.
+
+        Args:
+            tensordict: one step of any batch shape, or sequences under recurrent mode.
+
+        Returns:
+            The same tensordict.
+        """
+        observation = tensordict.get("observation")
+        observed = tensordict.get("observed")
+        is_init = tensordict.get("is_init")
+        parts = [observation, observed.to(observation.dtype)]
+        if self.with_action:
+            parts.append(tensordict.get("previous_action"))
+        stored = tensordict.get(_STATE, None)
+        # A copy: the network's input is nothing to keep in the data.
+        data = tensordict.copy().set(_INPUT, torch.cat(parts, -1))
+        self.memory(data)
+        features = data.get("features")
+        tensordict.set("features", features)
+        for key in self.memory.out_keys[1:]:
+            tensordict.set(key, data.get(key))
+        before = self._before(features, stored, is_init)
+        tensordict.set(("belief", "log_likelihood"), self.foresight(before, tensordict))
+        return tensordict
+
+    def _before(self, features: Tensor, stored: Tensor | None, is_init: Tensor) -> Tensor:
+        """Return the hidden state before each step; zero where an episode starts."""
+        given = torch.zeros_like(features) if stored is None else last_layer(stored)
+        if self.memory.recurrent_mode:
+            given = torch.cat([given[..., :1, :], features[..., :-1, :]], -2)
+        return torch.where(is_init, 0.0, given)
+
+
+def last_layer(stored: Tensor) -> Tensor:
+    """Return the hidden state that the features are made of.
+
+    Args:
+        stored: shape ``(*, layers, hidden)``.
+
+    Returns:
+        Shape ``(*, hidden)``.
+    """
+    return stored[..., -1, :]
+
+
+def build(
+    *,
+    obs_dim: int,
+    action_dim: int,
+    normalize: Literal["entry", "step"],
+    cell: Literal["gru", "lstm"],
+    hidden_size: int,
+    with_action: bool,
+    init_std: float,
+    min_std: float,
+) -> Belief:
+    """Build a recurrent belief.
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+        normalize: what the likelihood is divided by, ``entry`` or ``step``.
+        cell: ``gru`` or ``lstm``.
+        hidden_size: width of the hidden state.
+        with_action: whether the network reads the previous action.
+        init_std: standard deviation of the foreseen observation at the start.
+        min_std: its floor.
+
+    Returns:
+        The belief.
+    """
+    module = RecurrentBelief(
+        obs_dim,
+        action_dim,
+        cell=cell,
+        hidden_size=hidden_size,
+        with_action=with_action,
+        init_std=init_std,
+        min_std=min_std,
+    )
+    return Belief(
+        module,
+        hidden_size,
+        BeliefModelLoss(normalize=normalize),
+        observing=lambda: foreseeing(module, module.foresight, _STATE, last_layer),
+    )

@@ -1,0 +1,338 @@
+"""A transformer with a memory of its layers' inputs over the last steps of the episode."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
+from torchrl.modules.tensordict_module.rnn import recurrent_mode
+
+from beliefs import Belief
+from beliefs.prediction_head import Foresight, foreseeing
+from torchrl_drbpn import BeliefModelLoss
+
+_MEMORY: NestedKey = ("recurrent", "memory")
+_LENGTH: NestedKey = ("recurrent", "length")
+_HIDDEN: NestedKey = ("recurrent", "hidden")
+_STATE = (_MEMORY, _LENGTH, _HIDDEN)
+
+
+class MemoryAttention(nn.Module):
+    r"""Multi-head attention of some steps over themselves and the k - 1 steps before each.
+
+    For each head of dimension d, a query x and the entries m_j at distance j:
+
+    .. math::
+        p = \mathrm{softmax}_j\big((W_q x + c)^\top W_k (m_j + r_j) / \sqrt d\big), \qquad
+        y = \sum_{heads} W_o W_v \sum_j p_j m_j + e
+
+    with a learned r_j in the place of Transformer-XL's projected sinusoids. With r = 0 it is what
+    ``nn.MultiheadAttention`` computes, in another order: W_k is applied to the query and W_v to
+    the average, so that no entry is projected again. A bias of the keys would shift all scores
+    alike and one of the values add to e: there is neither.
+
+    Args:
+        width: of the steps.
+        heads: attention heads; divides the width.
+        window: k, steps that a step attends over, itself included.
+    """
+
+    def __init__(self, width: int, heads: int, window: int) -> None:
+        super().__init__()
+        self.split = (heads, width // heads, width)
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width, bias=False)
+        self.value = nn.Linear(width, width, bias=False)
+        self.out = nn.Linear(width, width)
+        # Oldest first. As large as the normalised entries that they are added to: distances can be
+        # told apart from the start. One bias per distance instead learns this many times slower.
+        self.position = nn.Parameter(torch.randn(window, width))
+        for layer in (self.query, self.key, self.value):
+            # Where nn.MultiheadAttention starts: the three as one matrix.
+            nn.init.xavier_uniform_(layer.weight, gain=0.5**0.5)
+        nn.init.zeros_(self.query.bias)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, entries: Tensor, visible: Tensor) -> Tensor:
+        """Attend from the last steps.
+
+        Args:
+            entries: k - 1 remembered ones, then the steps, shape ``(rows, k - 1 + time, width)``.
+            visible: whether an entry is of the episode of a step, bool, shape
+                ``(rows, time, k - 1 + time)``.
+
+        Returns:
+            Shape ``(rows, time, width)``.
+        """
+        rows, time, count = visible.shape
+        heads, head_dim, width = self.split
+        query = self.query(entries[:, -time:]).reshape(rows * time, heads, head_dim)
+        query = torch.bmm(query.transpose(0, 1), self.key.weight.view(self.split))
+        query = query.view(heads, rows, time, width).transpose(0, 1)
+        query = query.reshape(rows, heads * time, width)
+        bias = nn.functional.linear(query, self.position).view(rows, heads, time, -1)
+        bias = torch.where(visible.unsqueeze(1), shifted(bias), float("-inf"))
+        scale = head_dim**-0.5
+        scores = torch.baddbmm(
+            bias.view(rows, heads * time, count),
+            query,
+            entries.transpose(1, 2),
+            beta=scale,
+            alpha=scale,
+        )
+        mean = torch.bmm(scores.softmax(-1), entries).view(rows, heads, time, width)
+        mean = mean.transpose(0, 1).reshape(heads, rows * time, width)
+        value = torch.bmm(mean, self.value.weight.view(self.split).transpose(1, 2))
+        out: Tensor = self.out(value.transpose(0, 1).reshape(rows, time, width))
+        return out
+
+
+def shifted(window: Tensor) -> Tensor:
+    """Move what each step holds of its window to where the window lies.
+
+    Args:
+        window: of every step, oldest first, shape ``(*, time, k)``.
+
+    Returns:
+        Shape ``(*, time, k - 1 + time)``: row t holds its k values from entry t on, -inf elsewhere.
+    """
+    time, size = window.shape[-2:]
+    count = size - 1 + time
+    # Read with rows of `count`, rows of one more begin one further right each time.
+    padded = nn.functional.pad(window, (0, time), value=float("-inf"))
+    return padded.flatten(-2)[..., : time * count].view(*window.shape[:-1], count)
+
+
+class MemoryLayer(nn.Module):
+    """A pre-norm encoder layer that attends over its own inputs at earlier steps.
+
+    Args:
+        width: of the steps.
+        heads: attention heads; divides the width.
+        window: k, steps that a step attends over, itself included.
+    """
+
+    def __init__(self, width: int, heads: int, window: int) -> None:
+        super().__init__()
+        # Without a scale of its own: those of the projections do it, and what is remembered
+        # depends on the layers below alone.
+        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.attention = MemoryAttention(width, heads, window)
+        self.feedforward = nn.Sequential(
+            nn.LayerNorm(width),
+            nn.Linear(width, 2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, width),
+        )
+
+    def forward(self, x: Tensor, memory: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+        """Take some steps through the layer.
+
+        Args:
+            x: the steps, shape ``(rows, time, width)``.
+            memory: normalised inputs of the layer at the k - 1 steps before, oldest first, shape
+                ``(rows, k - 1, width)``.
+            visible: see :class:`MemoryAttention`.
+
+        Returns:
+            The steps' outputs, and the memory with their normalised inputs after it.
+        """
+        entries = torch.cat([memory, self.norm(x)], 1)
+        x = x + self.attention(entries, visible)
+        return x + self.feedforward(x), entries
+
+
+class TransformerBelief(TensorDictModuleBase):
+    """Attend over the last k steps: what arrived, which entries did, the action before.
+
+    A causal transformer with a memory, as Transformer-XL [Dai et al. 2019] and, for reinforcement
+    learning, GTrXL [Parisotto et al. 2020]: a step passes through the layers once, and each layer
+    attends over the step and its own inputs at the k - 1 steps before it in the same episode. With
+    several layers the features so depend on the last ``layers * (k - 1) + 1`` steps.
+
+    The recurrent state is the memory: normalised inputs of every layer, half of what keys and
+    values would take, and what the current weights make keys and values of. No gradient flows
+    into it. A step seen alone and the same step seen in a sequence give the same features, however
+    the rollout was cut, as long as the parameters stay. The features are the output of the last
+    layer; the auxiliary task is that of the recurrent networks.
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+        window: k, steps that a layer attends over, this one included.
+        width: of tokens and features.
+        heads: attention heads; divides the width.
+        layers: how many.
+        init_std: of the foreseen observation at the start, normalised observation units.
+        min_std: its floor.
+
+    Raises:
+        ValueError: for sizes that do not fit.
+    """
+
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        *,
+        window: int,
+        width: int,
+        heads: int,
+        layers: int,
+        init_std: float,
+        min_std: float,
+    ) -> None:
+        super().__init__()
+        if window < 1 or layers < 1 or heads < 1 or width < 1 or width % heads:
+            raise ValueError(
+                "`window`, `width`, `layers` and `heads` must be at least 1 and heads divide "
+                f"width, got window={window}, width={width}, layers={layers}, heads={heads}."
+            )
+        self.window, self.width = window, width
+        self.embed = nn.Linear(2 * obs_dim + action_dim, width)
+        self.layers = nn.ModuleList(MemoryLayer(width, heads, window) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+        self.foresight = Foresight(width, obs_dim, action_dim, init_std=init_std, min_std=min_std)
+        self.in_keys = ["observation", "observed", "previous_action", "is_init", *_STATE]
+        self.out_keys = [
+            "features",
+            ("belief", "log_likelihood"),
+            *(("next", *key) for key in _STATE),
+        ]
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Make the transform that puts the memory into the environment."""
+        return TensorDictPrimer(
+            {
+                _MEMORY: Unbounded((len(self.layers), self.window - 1, self.width)),
+                _LENGTH: Unbounded((1,), dtype=torch.int64),
+                _HIDDEN: Unbounded((self.width,)),
+            },
+            expand_specs=True,
+        )
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write features, log-likelihood and the next memory.
+
+        Args:
+            tensordict: one step of any batch shape, or sequences under recurrent mode.
+
+        Returns:
+            The same tensordict.
+        """
+        observation = tensordict.get("observation")
+        seen = tensordict.get("observed").to(observation.dtype)
+        token = torch.cat([observation, seen, tensordict.get("previous_action")], -1)
+        is_init = tensordict.get("is_init")
+        batch = token.shape[:-1]
+        rows, time = batch.numel(), 1
+        if recurrent_mode():
+            rows, time = batch[:-1].numel(), batch[-1]
+        x = self.embed(token.reshape(rows, time, token.shape[-1]))
+        is_init = is_init.reshape(rows, time)
+
+        memory, length, hidden = self._stored(tensordict, x)
+        step = torch.arange(time, device=x.device)
+        # Where the episode of each step began, counted from the first; the memory lies before it.
+        start = torch.where(is_init, step, -length).cummax(1).values
+        features, memories = self._attend(x, memory, start)
+        before = torch.cat([hidden.unsqueeze(1), features[:, :-1]], 1)
+        before = torch.where(is_init.unsqueeze(-1), 0.0, before)
+
+        features = features.reshape(*batch, self.width)
+        tensordict.set("features", features)
+        likelihood = self.foresight(before.reshape(*batch, self.width), tensordict)
+        tensordict.set(("belief", "log_likelihood"), likelihood)
+        tensordict.set(("next", *_MEMORY), memories.reshape(*batch, *memories.shape[2:]))
+        length = (step - start + 1).clamp_max(self.window - 1)
+        tensordict.set(("next", *_LENGTH), length.reshape(*batch, 1))
+        tensordict.set(("next", *_HIDDEN), features)
+        return tensordict
+
+    def _stored(self, tensordict: TensorDictBase, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return memory, its valid length and hidden state before the first step of each row."""
+        rows, time = x.shape[:2]
+        zeros = (
+            x.new_zeros(rows, len(self.layers), self.window - 1, self.width),
+            torch.zeros(rows, 1, dtype=torch.int64, device=x.device),
+            x.new_zeros(rows, self.width),
+        )
+        first = []
+        for key, zero in zip(_STATE, zeros, strict=True):
+            value = tensordict.get(key, None)
+            first.append(
+                zero if value is None else value.reshape(rows, time, *zero.shape[1:])[:, 0]
+            )
+        return first[0], first[1], first[2]
+
+    def _attend(self, x: Tensor, memory: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+        """Return features (rows, time, width) and the memory after each step.
+
+        Args:
+            x: embedded steps, shape ``(rows, time, width)``.
+            memory: before the first of them, shape ``(rows, layers, k - 1, width)``.
+            start: where the episode of each began, shape ``(rows, time)``.
+        """
+        # The entries by the step they belong to; which are outside the window the layers know.
+        entry = torch.arange(1 - self.window, x.shape[1], device=x.device)
+        visible = entry >= start.unsqueeze(-1)
+        remembered = []
+        for i, layer in enumerate(self.layers):
+            x, entries = layer(x, memory[:, i], visible)
+            remembered.append(entries.detach())
+        # Views of the last k - 1 entries up to each step: a sequence's are read by nobody.
+        windows = torch.stack(remembered, 1).unfold(2, self.window - 1, 1)[:, :, 1:]
+        return self.norm(x), windows.permute(0, 2, 1, 4, 3)
+
+
+def build(
+    *,
+    obs_dim: int,
+    action_dim: int,
+    normalize: Literal["entry", "step"],
+    window: int,
+    width: int,
+    heads: int,
+    layers: int,
+    init_std: float,
+    min_std: float,
+) -> Belief:
+    """Build a transformer memory.
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+        normalize: what the likelihood is divided by, ``entry`` or ``step``.
+        window: steps that a layer attends over.
+        width: of tokens and features.
+        heads: attention heads.
+        layers: how many.
+        init_std: of the foreseen observation at the start.
+        min_std: its floor.
+
+    Returns:
+        The belief.
+    """
+    module = TransformerBelief(
+        obs_dim,
+        action_dim,
+        window=window,
+        width=width,
+        heads=heads,
+        layers=layers,
+        init_std=init_std,
+        min_std=min_std,
+    )
+    return Belief(
+        module,
+        width,
+        BeliefModelLoss(normalize=normalize),
+        observing=lambda: foreseeing(module, module.foresight, _HIDDEN, lambda hidden: hidden),
+    )

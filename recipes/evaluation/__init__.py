@@ -1,0 +1,1 @@
+"""Trained agents under conditions that they were not trained for."""

@@ -1,0 +1,160 @@
+"""Which sensors a trained belief would keep, by the model it has learned.
+
+P, the covariance before the readings, is the learned Q: the paper's filter takes the transition at
+the mean only, so that Q is what every step but an episode's first predicts, whatever arrived before
+(eq. 8). A sensor is thus valued by what it adds within one step, beside a state that was known one
+step ago: quantities that change fast come first. H P H' and R are in the units of the normalised
+observation, one running standard deviation of each sensor in training.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from training.errors import UserError
+from training.sensors import sensor_names
+
+from evaluation.trained import TrainedAgent
+from torchrl_drbpn import BeliefFilterModule, MaskedObservationNorm, select_sensors
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """What a trained belief has learned about its sensors, float64.
+
+    Attributes:
+        names: of the sensors.
+        seed: of the training.
+        emission_matrix: H, shape ``(obs, state)``.
+        predicted_cov: P = Q, shape ``(state, state)``.
+        emission_cov: R, shape ``(obs, obs)``.
+        added_std: standard deviation of the noise that the sensors did have in training, spikes
+            included, in the units of R's, shape ``(obs,)``; R should hold it, and what the model
+            can't explain.
+    """
+
+    names: list[str]
+    seed: int
+    emission_matrix: Tensor
+    predicted_cov: Tensor
+    emission_cov: Tensor
+    added_std: Tensor
+
+    @property
+    def observation_cov(self) -> Tensor:
+        """Return H P H' + R, the covariance of what a step's sensors read, shape ``(obs, obs)``."""
+        H = self.emission_matrix
+        return H @ self.predicted_cov @ H.mT + self.emission_cov
+
+    def ranking(self, criterion: Literal["D", "A"]) -> Tensor:
+        """Return all sensors, best first, shape ``(obs,)``.
+
+        Args:
+            criterion: "D": information; "A": the variance left in what the sensors would read
+                without noise, tr H P+ H', which no choice of the state's units changes.
+
+        Returns:
+            Indices.
+        """
+        H, count = self.emission_matrix, len(self.names)
+        target = H if criterion == "A" else None
+        return select_sensors(
+            H, self.predicted_cov, self.emission_cov, count, criterion=criterion, target=target
+        ).indices
+
+    def along(self, orders: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Say what sensors tell, read in a given order.
+
+        With L L' the covariance of the readings in that order, and N N' that of their noise, the
+        readings up to k tell sum_{i <= k} log(L_ii / N_ii) nats about the state.
+
+        Args:
+            orders: indices of sensors, shape ``(*batch, count)``.
+
+        Returns:
+            The information of the first k sensors, nats, and the share of tr H P H' that they
+            leave, each of shape ``(*batch, count)``.
+        """
+        H = self.emission_matrix
+        signal = H @ self.predicted_cov @ H.mT
+        pairs = orders.unsqueeze(-1), orders.unsqueeze(-2)
+        readings = torch.linalg.cholesky(self.observation_cov[pairs])
+        noise = torch.linalg.cholesky(self.emission_cov[pairs])
+        ratio = readings.diagonal(dim1=-2, dim2=-1) / noise.diagonal(dim1=-2, dim2=-1)
+        # Columns of Cov(H s, readings) L^-T: what each reading explains beside those before it.
+        explained = torch.linalg.solve_triangular(readings, signal[orders], upper=False)
+        taken = explained.square().sum(-1).cumsum(-1)
+        return ratio.log().cumsum(-1), 1.0 - taken / signal.trace()
+
+
+def learned_sensors(trained: TrainedAgent) -> SensorModel:
+    """Read H, P and R from a trained belief.
+
+    Args:
+        trained: the agent; its belief must be the belief filter.
+
+    Returns:
+        The model of its sensors.
+
+    Raises:
+        UserError: if the belief has no H, P and R, or no P that holds at every step.
+    """
+    name = trained.settings.belief.get("name")
+    module = trained.agent.belief
+    if not isinstance(module, BeliefFilterModule):
+        raise UserError(
+            f"`belief={name}` has learned no H, P and R to choose sensors by: take a run with "
+            "belief=drbpn."
+        )
+    with torch.no_grad():
+        model = module.filter.state_space()
+    if not isinstance(model.transition_cov, Tensor):
+        raise UserError(
+            f"`belief={name}` predicts another covariance at every state "
+            "(belief.transition.cov_network=true), so no one P ranks its sensors: take a run with "
+            "cov_network=false."
+        )
+    env, noise = trained.settings.env, trained.settings.noise
+    norm = next(t for t in trained.statistics.transform if isinstance(t, MaskedObservationNorm))
+    wide = model.double()
+    variance = (noise.sigma * noise.scale) ** 2 + noise.spike_probability * noise.spike_std**2
+    return SensorModel(
+        sensor_names(env.id, env.version, wide.emission_matrix.shape[0]),
+        trained.settings.seed,
+        wide.emission_matrix.detach(),
+        model.transition_cov.double().detach(),
+        wide.full_emission_cov().detach(),
+        math.sqrt(variance) / norm.scale.double(),
+    )
+
+
+def kept_sensors(trained: TrainedAgent, count: int) -> list[int]:
+    """Return the sensors that tell most about the state, by the learned H, P and R.
+
+    Greedy D-optimal, see :func:`torchrl_drbpn.select_sensors`; the first sensors of a larger count
+    are those of a smaller one.
+
+    Args:
+        trained: the agent; its belief must be the belief filter.
+        count: how many sensors to keep.
+
+    Returns:
+        Indices of components, best first.
+
+    Raises:
+        UserError: if the belief has no H, P and R, or has not that many sensors.
+    """
+    model = learned_sensors(trained)
+    if not 0 <= count <= len(model.names):
+        raise UserError(
+            f"`count` must be from 0 to the {len(model.names)} sensors of "
+            f"{trained.settings.env.env_id}, got {count}."
+        )
+    chosen = select_sensors(
+        model.emission_matrix, model.predicted_cov, model.emission_cov, count, criterion="D"
+    )
+    return chosen.indices.tolist()
