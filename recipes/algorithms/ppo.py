@@ -18,8 +18,6 @@ from training.rollout import (
     to_sequences,
 )
 
-from algorithms.prepared import PreparedAdam
-
 _NAMES = {"kl_approx": "kl", "ESS": "ess"}
 
 
@@ -110,7 +108,6 @@ def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
     parameters = list(ppo.agent.parameters())
     for group in optimizer.param_groups:
         group["lr"] = lr
-    prepared: PreparedAdam | None = None
     seen: dict[str, list[torch.Tensor]] = {}
     for sequences in ppo.epochs(data):
         for minibatch in minibatches(sequences, optim.minibatches, ppo.generator):
@@ -118,29 +115,14 @@ def _update(ppo: PPO, data: TensorDictBase, lr: float) -> dict[str, float]:
             terms = {key: value for key, value in out.items() if isinstance(value, torch.Tensor)}
             total = sum(value for key, value in terms.items() if key.startswith("loss"))
             assert isinstance(total, torch.Tensor)
-            for parameter in parameters:
-                parameter.grad = None
+            optimizer.zero_grad()
             torch.autograd.backward(total)
-            stepped = [parameter for parameter in parameters if parameter.grad is not None]
-            gradients = [p.grad for p in stepped if p.grad is not None]
-            terms["grad_norm"] = _clip(gradients, optim.max_grad_norm)
-            if prepared is None or not prepared.step(stepped):
-                optimizer.step()
-                prepared = PreparedAdam(optimizer, stepped)
+            terms["grad_norm"] = torch.nn.utils.clip_grad_norm_(parameters, optim.max_grad_norm)
+            optimizer.step()
             for key, value in terms.items():
                 seen.setdefault(key, []).append(value.detach())
     means = {key: torch.stack(values).mean() for key, values in seen.items()}
     return {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
-
-
-def _clip(gradients: list[torch.Tensor], limit: float) -> torch.Tensor:
-    """Scale the gradient down to norm ``limit``, as clip_grad_norm_ does; return its norm.
-
-    Without sorting the parameters by device and dtype at every step: here all have one.
-    """
-    norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-    torch._foreach_mul_(gradients, (limit / (norm + 1e-6)).clamp_max_(1.0))
-    return norm
 
 
 def build(settings: Settings, agent: Agent) -> PPO:

@@ -45,8 +45,6 @@ class Agent(nn.Module):
         critic: the value head, ``state_value`` given ``features`` and, with
             ``heads.critic_input=complete``, the complete observation.
         policy: belief module, then policy head.
-        location: the network in the policy head.
-        scale: what adds the state-independent scale to its output.
         model_loss: the loss of the belief's own model, or None.
     """
 
@@ -75,11 +73,8 @@ class Agent(nn.Module):
         )
         # Not registered a second time: its parts are above.
         self.__dict__["policy"] = TensorDictSequential(self.belief, self.actor)
-        self.__dict__["location"], self.__dict__["scale"] = location, scale
 
     policy: TensorDictSequential
-    location: nn.Sequential
-    scale: AddStateIndependentNormalScale
 
     def make_loss(self, settings: LossSettings) -> LossModule:
         """Build the loss: PPO and, where the belief has a model, its likelihood.

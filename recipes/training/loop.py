@@ -16,7 +16,6 @@ from torchrl.objectives.value import GAE
 
 from training.agent import COMPLETE, Agent, add_primers
 from training.config import Settings
-from training.decision import RolloutPolicy
 from training.envs import make_environment, task_dims
 from training.errors import UserError
 from training.rollout import (
@@ -91,16 +90,14 @@ def assemble(settings: Settings) -> Training:
         complete=COMPLETE in agent.critic.in_keys,
     )
     add_primers(env, agent)
-    policy = RolloutPolicy(agent)
     collector = Collector(
         env,
-        policy,
+        agent.policy,
         frames_per_batch=settings.collector.frames,
         total_frames=-1,
         track_traj_ids=False,
         use_buffers=True,
         auto_register_policy_transforms=False,
-        pre_collect_hook=policy.refresh,
     )
     return Training(
         belief=belief,
