@@ -3,7 +3,7 @@
 from importlib.metadata import PackageNotFoundError, version
 
 from torchrl_drbpn import functional
-from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv, LeanTransformedEnv
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 from torchrl_drbpn.functional import select_sensors
 from torchrl_drbpn.modules import (
     BeliefDivergedError,
@@ -45,7 +45,6 @@ __all__ = [
     "FillLastObserved",
     "GaussianTransition",
     "GymnasiumBatchEnv",
-    "LeanTransformedEnv",
     "LinearGaussianEmission",
     "MaskedObservationNorm",
     "ObservationMissingness",

@@ -25,7 +25,7 @@ from torchrl_drbpn import (
     SensorOutages,
     seed_env,
 )
-from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv, LeanTransformedEnv
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 from training.config import (
     EnvSettings,
     MissingnessSettings,
@@ -111,7 +111,7 @@ def make_environment(
         StepCounter(),
         InitTracker(),
     ]
-    out = LeanTransformedEnv(base, Compose(*transforms))
+    out = TransformedEnv(base, Compose(*transforms))
     seed_env(out, seed)
     return out
 

@@ -2,6 +2,5 @@
 
 from torchrl_drbpn.envs.envpool_batch import EnvPoolBatchEnv
 from torchrl_drbpn.envs.gymnasium_batch import GymnasiumBatchEnv
-from torchrl_drbpn.envs.lean import LeanTransformedEnv
 
-__all__ = ["EnvPoolBatchEnv", "GymnasiumBatchEnv", "LeanTransformedEnv"]
+__all__ = ["EnvPoolBatchEnv", "GymnasiumBatchEnv"]

@@ -17,8 +17,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_drbpn.envs.stepping import Plan
-
 __all__ = ["NO_SEED", "BatchedSimulators"]
 
 NO_SEED = -1
@@ -50,7 +48,6 @@ class BatchedSimulators(EnvBase):
 
     # A frame skip belongs to the simulator: TorchRL must not add its own.
     _has_frame_skip = True
-    _plan: Plan | None = None
     _obs_dim: int
     _action_low: NDArray[Any]
     _action_high: NDArray[Any]
@@ -154,20 +151,6 @@ class BatchedSimulators(EnvBase):
         )
 
     # Stepping -------------------------------------------------------------------------------
-
-    def empty_cache(self) -> None:
-        """Forget what was derived from the specs."""
-        super().empty_cache()
-        self._plan = None
-
-    def _step_and_maybe_reset(
-        self, tensordict: TensorDictBase
-    ) -> tuple[TensorDictBase, TensorDictBase]:
-        if self._plan is None:
-            self._plan = Plan(self, self)
-        if self._plan.usable and self._plan.takes(tensordict):
-            return self._plan(tensordict)
-        return super()._step_and_maybe_reset(tensordict)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         if not self._all_started:
