@@ -1,0 +1,161 @@
+"""The moments of incomplete data are those of the observed values alone.
+
+Specified here: `masked_moments` against torch.var on the values that are left when the missing
+ones are deleted; merging in any order and grouping; no loss of precision where the mean is large;
+nothing observed changes nothing; a wild reading is moved to a bound and the others are not.
+"""
+
+import pytest
+import torch
+
+from torchrl_drbpn.functional.running_moments import (
+    RunningMoments,
+    masked_moments,
+    merge_moments,
+    spread,
+    winsorize,
+)
+
+TIGHT = {"rtol": 1e-11, "atol": 1e-11}
+EPS = 1e-8
+
+
+def nothing(obs=3):
+    return RunningMoments(*torch.zeros(3, obs, dtype=torch.float64))
+
+
+def draw(samples, obs, seed=0, missing=0.4, dtype=torch.float64):
+    """Return values with NaN where they are missing, and the mask."""
+    generator = torch.Generator().manual_seed(seed)
+    value = torch.randn(samples, obs, generator=generator, dtype=dtype)
+    value = value * torch.arange(1, obs + 1) + 10 * torch.arange(obs)
+    observed = torch.rand(samples, obs, generator=generator) >= missing
+    return torch.where(observed, value, torch.nan), observed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_masked_moments_are_those_of_the_observed_values_alone(seed):
+    value, observed = draw(50, 4, seed)
+    moments = masked_moments(value, observed)
+    for i in range(4):
+        kept = value[observed[:, i], i]
+        assert moments.n[i] == len(kept)
+        torch.testing.assert_close(moments.mean[i], kept.mean(), **TIGHT)
+        torch.testing.assert_close(moments.var[i], torch.var(kept, correction=0), **TIGHT)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_merging_gives_the_same_in_any_order_and_grouping(seed):
+    value, observed = draw(97, 3, seed)
+    whole = masked_moments(value, observed)
+    generator = torch.Generator().manual_seed(seed)
+    sizes = [1, 40, 7, 2, 47]
+    batches = [
+        masked_moments(*pair)
+        for pair in zip(value.split(sizes), observed.split(sizes), strict=True)
+    ]
+    for _ in range(5):
+        order = torch.randperm(5, generator=generator).tolist()
+        merged = nothing()
+        for index in order:
+            merged = merge_moments(merged, batches[index])
+        right = merge_moments(batches[order[3]], batches[order[4]])
+        tree = merge_moments(
+            merge_moments(batches[order[0]], batches[order[1]]),
+            merge_moments(batches[order[2]], right),
+        )
+        for other in (merged, tree):
+            for a, b in zip(other, whole, strict=True):
+                torch.testing.assert_close(a, b, **TIGHT)
+
+
+def test_merging_with_nothing_observed_changes_nothing():
+    value, observed = draw(20, 3)
+    moments = masked_moments(value, observed)
+    unseen = masked_moments(value, torch.zeros_like(observed))
+    for merged in (merge_moments(moments, unseen), merge_moments(unseen, moments)):
+        for a, b in zip(merged, moments, strict=True):
+            assert torch.equal(a, b)
+
+
+def test_a_mean_far_larger_than_the_spread_costs_no_precision():
+    # the textbook formula E[x^2] - E[x]^2 would lose all 16 digits here: 1e8^2 = 1e16
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(1000, 2, generator=generator, dtype=torch.float64)
+    merged = nothing(2)
+    for batch in (noise + 1e8).split(10):
+        merged = merge_moments(merged, masked_moments(batch))
+    torch.testing.assert_close(merged.var, noise.var(0, correction=0), rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize("seen", [0, 1])
+def test_with_fewer_than_two_values_the_spread_is_one(seen):
+    observed = torch.arange(5)[:, None] < seen
+    value = torch.full((5, 1), 3.0, dtype=torch.float64)
+    assert spread(masked_moments(value, observed), EPS).item() == 1.0
+
+
+@pytest.mark.parametrize(
+    ("mask", "error"), [(torch.ones(4, 2), TypeError), (torch.ones(4).bool(), ValueError)]
+)
+def test_a_mask_of_wrong_dtype_or_shape_is_refused(mask, error):
+    for call in (masked_moments, lambda x, m: winsorize(x, m, nothing(2), EPS)):
+        with pytest.raises(error, match="`observed` must"):
+            call(torch.zeros(4, 2), mask)
+
+
+def test_moments_of_other_sensors_are_not_merged():
+    with pytest.raises(ValueError, match=r"one shape \(\*event\), got \[\(2,\), \(3,\)\]"):
+        merge_moments(nothing(2), nothing(3))
+
+
+# ------------------------------------------------------------------------------------ wild readings
+@pytest.mark.parametrize("missing", [0.0, 0.9])
+@pytest.mark.parametrize("learned", [False, True], ids=["first", "later"])
+def test_readings_of_a_normal_sensor_are_left_as_they_are(missing, learned):
+    value, observed = draw(2000, 3, missing=missing)
+    before = masked_moments(*draw(500, 3, seed=1)) if learned else nothing()
+    bounded, counted = winsorize(value, observed, before, EPS)
+    assert torch.equal(counted, observed)
+    assert torch.equal(bounded[observed], value[observed])
+
+
+@pytest.mark.parametrize("wild", [1e5, -1e5, 1e160, 1.7e308])
+@pytest.mark.parametrize("learned", [False, True], ids=["first", "later"])
+@pytest.mark.parametrize("count", [200, 20_000])
+def test_one_wild_reading_does_not_undo_a_sensor(wild, learned, count):
+    value, _ = draw(count, 3, missing=0.0)
+    value[7, 1] = wild
+    before = masked_moments(*draw(500, 3, seed=1)) if learned else nothing()
+    after = merge_moments(
+        before,
+        masked_moments(*winsorize(value, torch.ones_like(value).bool(), before, EPS)),
+    )
+    spreads = spread(after, EPS)
+    assert (spreads / torch.arange(1, 4) - 1).abs().amax() < 0.6
+    assert (after.mean - 10 * torch.arange(3)).abs().amax() < 0.6
+
+
+def test_a_sensor_that_rarely_speaks_is_learned():
+    value = torch.zeros(2000, 1, dtype=torch.float64)
+    value[::100] = 1.0  # one reading in a hundred
+    bounded, counted = winsorize(value, torch.ones_like(value).bool(), nothing(1), EPS)
+    assert counted.all()
+    assert torch.equal(bounded, value)
+
+
+def test_a_scale_that_grows_is_followed():
+    # by a factor of 1000, as of a robot that learns to run
+    generator = torch.Generator().manual_seed(0)
+    moments = masked_moments(torch.randn(2000, 1, generator=generator))
+    for _ in range(12):
+        value = 1000 * torch.randn(2000, 1, generator=generator)
+        batch = winsorize(value, torch.ones_like(value).bool(), moments, EPS)
+        moments = merge_moments(moments, masked_moments(*batch))
+    assert spread(moments, EPS).item() > 700
+
+
+def test_of_fewer_than_three_readings_nothing_is_learned():
+    value = torch.tensor([[1.0], [1e160], [0.0]])
+    observed = torch.tensor([[True], [True], [False]])
+    assert not winsorize(value, observed, nothing(1), EPS)[1].any()

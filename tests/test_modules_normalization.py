@@ -1,0 +1,380 @@
+"""What `MaskedObservationNorm` is held to: statistics that are the agent's.
+
+Specified here: what is written; that it learns in `update` alone, each reading that arrived once,
+however a rollout is cut; that one wild reading undoes no sensor; that it is saved, compiled,
+exported and sent to collectors as part of a policy; what is refused.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+
+from torchrl_drbpn import GymnasiumBatchEnv, ObservationMissingness
+from torchrl_drbpn.modules import MaskedObservationNorm
+
+OBS = 3
+DOUBLE = torch.float64
+
+
+def make_rollout(seed: int = 0, batch=(4,), time: int = 25, missing: float = 0.3) -> TensorDict:
+    """Draw readings in order; an episode ends after 10 steps, its last reading is a next one."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (*batch, time, OBS)
+
+    def readings() -> tuple[torch.Tensor, torch.Tensor]:
+        x = torch.randn(shape, generator=generator, dtype=DOUBLE) * torch.arange(1, OBS + 1)
+        seen = torch.rand(shape, generator=generator) >= missing
+        return (x + 10 * torch.arange(OBS)).where(seen, 0.0), seen
+
+    (x, seen), (last, last_seen) = readings(), readings()
+    done = torch.zeros(*batch, time, 1, dtype=torch.bool)
+    done[..., 9, :] = True
+    is_init = torch.zeros_like(done)
+    is_init[..., 0, :] = is_init[..., 10, :] = True
+    # Between ends of episodes the next reading is that of the next step.
+    ends = done.clone()
+    ends[..., -1, :] = True
+    following = TensorDict(
+        observation=last.where(ends, x.roll(-1, -2)),
+        observed=last_seen.where(ends, seen.roll(-1, -2)),
+        done=done,
+        batch_size=(*batch, time),
+    )
+    return TensorDict(
+        {"observation": x, "observed": seen, "is_init": is_init, "next": following},
+        batch_size=(*batch, time),
+    )
+
+
+def received(rollout: TensorDict, component: int) -> torch.Tensor:
+    """Return the readings of a sensor that arrived, each once, by plain loops."""
+    out = []
+    for row in rollout.reshape(-1, rollout.shape[-1]):
+        for step in row:
+            out += [step] + ([step["next"]] if step["next", "done"] else [])
+        if not row[-1]["next", "done"]:
+            out.append(row[-1]["next"])
+    return torch.stack([s["observation"][component] for s in out if s["observed"][component]])
+
+
+def learned(*rollouts: TensorDict, **kwargs) -> MaskedObservationNorm:
+    norm = MaskedObservationNorm(OBS, **kwargs)
+    for rollout in rollouts:
+        norm.update(rollout)
+    return norm
+
+
+def state(norm: MaskedObservationNorm) -> list[torch.Tensor]:
+    return [norm.count.double(), norm.mean, norm.var]
+
+
+def assert_same_state(first: MaskedObservationNorm, second: MaskedObservationNorm) -> None:
+    for a, b in zip(state(first), state(second), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
+
+
+# ---------------------------------------------------------------------------------------- learning
+def test_every_reading_that_arrived_is_learned_from_once():
+    rollout = make_rollout()
+    norm = learned(rollout)
+    for i in range(OBS):
+        x = received(rollout, i)
+        assert norm.count[i] == len(x)
+        torch.testing.assert_close(norm.mean[i], x.mean())
+        torch.testing.assert_close(norm.std[i], (x.var(correction=0) + norm.eps).sqrt())
+
+
+def test_however_a_rollout_is_cut_the_same_is_learned():
+    # long enough a first part that both bound wild readings alike: by nothing
+    rollout = make_rollout(batch=(50,), time=24)
+    parts = rollout.split(12, 1)
+    assert_same_state(learned(rollout), learned(*parts))
+    sequences = rollout.reshape(-1, 6)
+    assert_same_state(learned(rollout), learned(sequences))
+
+
+def test_any_leading_dimensions_are_learned_from():
+    rollout = make_rollout(batch=(2, 3))
+    assert_same_state(learned(rollout), learned(rollout.reshape(6, 25)))
+    row = rollout[0, 0]
+    assert_same_state(learned(row), learned(row.unsqueeze(0)))
+
+
+def test_without_next_the_steps_alone_count():
+    rollout = make_rollout().exclude("next", "is_init")
+    assert torch.equal(learned(rollout).count, rollout["observed"].sum((0, 1)))
+
+
+def test_what_did_not_arrive_may_hold_anything():
+    rollout = make_rollout()
+    wild = rollout.clone()
+    for part in (wild, wild["next"]):
+        part["observation"].masked_fill_(~part["observed"], torch.nan)
+    norm, other = learned(rollout), learned(wild)
+    assert_same_state(norm, other)
+    key = "normalized_observation"
+    assert torch.equal(norm(rollout.clone())[key], norm(wild)[key])
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_reading_that_is_no_number_is_refused_and_not_learned(bad):
+    norm, rollout = learned(make_rollout()), make_rollout(1)
+    before = copy.deepcopy(norm)
+    rollout["observation"][0, 3, 1] = bad
+    rollout["observed"][0, 3, 1] = True
+    with pytest.raises(
+        ValueError, match=r"`observation` holds NaN or an infinity.*ObservedFromNaN"
+    ):
+        norm.update(rollout)
+    assert_same_state(norm, before)
+
+
+@pytest.mark.parametrize("wild", [1e5, 1e160])
+@pytest.mark.parametrize("first", [True, False], ids=["first", "later"])
+def test_one_wild_reading_among_20000_undoes_no_sensor(wild, first):
+    clean = make_rollout(batch=(100,), time=200, missing=0.0)
+    spoilt = clean.clone()
+    spoilt["observation"][3, 50, 1] = wild
+    rollouts = (spoilt,) if first else (clean, spoilt)
+    norm, expected = learned(*rollouts), learned(*[clean] * len(rollouts))
+    torch.testing.assert_close(norm.std, expected.std, rtol=0.05, atol=0)
+    torch.testing.assert_close(norm.mean, expected.mean, rtol=0, atol=0.02)
+
+
+def test_in_float32_nothing_overflows():
+    rollout = make_rollout(missing=0.0).apply(lambda x: x.float() if x.is_floating_point() else x)
+    rollout["observation"] *= 1e10
+    rollout["next", "observation"] *= 1e10
+    norm = MaskedObservationNorm(OBS, dtype=torch.float32)
+    for _ in range(3):
+        norm.update(rollout)
+    norm.count.fill_(10**12)  # a run of years
+    norm.update(rollout)
+    assert norm.count.gt(10**12).all()
+    exact = learned(rollout)
+    torch.testing.assert_close(norm.std.double(), exact.std, rtol=1e-4, atol=0)
+    rollout["observation"] *= 1e20  # squared more than a float32 holds
+    norm.update(rollout)
+    assert norm.var.isfinite().all()
+    assert norm(rollout)["normalized_observation"].isfinite().all()
+
+
+# ----------------------------------------------------------------------------------------- scaling
+def test_what_arrived_is_standardised_and_the_rest_is_zero():
+    rollout = make_rollout()
+    norm = learned(rollout)
+    x, seen = rollout["observation"], rollout["observed"]
+    expected = ((x - norm.mean) / norm.std).where(seen, 0.0)
+    torch.testing.assert_close(norm(rollout)["normalized_observation"], expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+def test_before_it_has_learned_it_is_the_identity_up_to_the_clip(dtype):
+    x = torch.tensor([0.3, -7.0, 1e30], dtype=dtype)
+    out = MaskedObservationNorm(OBS)(TensorDict(observation=x, observed=torch.ones(OBS).bool()))
+    expected = torch.tensor([0.3, -7.0, 10.0], dtype=dtype)
+    torch.testing.assert_close(out["normalized_observation"], expected, rtol=0, atol=0)
+
+
+def test_denormalising_undoes_normalising_but_for_the_clip():
+    rollout = make_rollout()
+    norm = learned(rollout, clip=None)
+    x = rollout["observation"]
+    torch.testing.assert_close(norm.denormalize(norm.normalize(x)), x)
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (2, 5), (2, 3, 4)])
+def test_any_leading_dimensions_are_scaled_and_nothing_is_changed(shape):
+    norm = learned(make_rollout())
+    data = TensorDict(
+        observation=torch.randn(*shape, OBS), observed=torch.rand(*shape, OBS) < 0.5,
+        batch_size=shape,
+    )  # fmt: skip
+    before, statistics = data.clone(), copy.deepcopy(norm)
+    out = norm(data)
+    assert out["normalized_observation"].shape == (*shape, OBS)
+    for key in before.keys(True):
+        assert torch.equal(data[key], before[key])
+    assert_same_state(norm, statistics)
+    torch.testing.assert_close(norm(**before), out["normalized_observation"])
+
+
+def test_what_was_filled_is_standardised_and_what_was_never_seen_reads_zero():
+    norm = learned(make_rollout(), missing="keep")
+    x = torch.tensor([5.0, 6.0, torch.nan])
+    out = norm(TensorDict(observation=x, observed=torch.tensor([True, False, False])))
+    z = out["normalized_observation"]
+    torch.testing.assert_close(z[:2].double(), (x.double() - norm.mean)[:2] / norm.std[:2])
+    assert z[2] == 0
+
+
+def test_a_complete_observation_is_scaled_alike_and_not_learned_from():
+    keys = ("complete_observation", "normalized_complete")
+    rollout = make_rollout()
+    norm = learned(rollout.clone().set(keys[0], torch.full((4, 25, OBS), 1e3)), complete_keys=keys)
+    assert_same_state(norm, learned(rollout))
+    rollout[keys[0]] = rollout["observation"]
+    out = norm(rollout)
+    torch.testing.assert_close(out[keys[1]], norm.normalize(rollout["observation"]))
+    assert norm(make_rollout()).get(keys[1], None) is None
+
+
+def test_an_observation_alone_arrives_as_a_whole():
+    rollout = make_rollout(missing=0.0)
+    norm = learned(rollout.exclude("observed", ("next", "observed")), in_keys=["observation"])
+    assert_same_state(norm, learned(rollout))
+
+
+# -------------------------------------------------------------------------------- part of a policy
+def make_policy(norm: MaskedObservationNorm, width: int = OBS) -> TensorDictSequential:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        head = TensorDictModule(
+            torch.nn.Linear(width, 1), in_keys=["normalized_observation"], out_keys=["action"]
+        )
+    return TensorDictSequential(norm, head)
+
+
+def test_the_state_survives_a_file_read_without_running_code():
+    norm = learned(make_rollout())
+    file = io.BytesIO()
+    torch.save(make_policy(norm).state_dict(), file)
+    file.seek(0)
+    other = MaskedObservationNorm(OBS)
+    make_policy(other).load_state_dict(torch.load(file, weights_only=True))
+    assert_same_state(norm, other)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("mean", torch.zeros(4), r"0\.mean` must have shape \(3,\), got \(4,\)"),
+        (
+            "var",
+            torch.tensor([1.0, -1.0, 1.0]),
+            r"`module\.0\.var` must be finite and at least 0, got -1",
+        ),
+        ("var", torch.tensor([1.0, torch.inf, 1.0]), r"0\.var` must be finite"),
+        ("mean", torch.tensor([1.0, torch.nan, 1.0]), r"0\.mean` must be finite, got nan"),
+        (
+            "count",
+            torch.tensor([1, -1, 1]),
+            r"`module\.0\.count` must be finite and at least 0, got -1",
+        ),
+    ],
+)
+def test_statistics_that_are_none_are_refused_at_load(name, value, match):
+    policy = make_policy(learned(make_rollout()))
+    with pytest.raises(ValueError, match=match):
+        make_policy(MaskedObservationNorm(OBS)).load_state_dict(
+            {**policy.state_dict(), f"module.0.{name}": value}
+        )
+
+
+def test_compiled_without_a_break_it_is_the_same_and_sees_an_update():
+    policy = make_policy(learned(make_rollout())).double()
+    compiled = torch.compile(policy, fullgraph=True, backend="eager")
+    for seed in (1, 2):
+        data = make_rollout(seed).select("observation", "observed")
+        assert torch.equal(compiled(data.clone())["action"], policy(data.clone())["action"])
+        policy[0].update(make_rollout(seed + 5))
+
+
+def test_exported_it_is_the_same():
+    norm = learned(make_rollout())
+    policy = make_policy(norm).double()
+    data = make_rollout(1)
+    inputs = {"observation": data["observation"], "observed": data["observed"]}
+    exported = torch.export.export(policy, args=(), kwargs=inputs, strict=False).module()
+    torch.testing.assert_close(exported(**inputs)[-1], policy(data.clone())["action"])
+
+
+def test_vectorised_it_is_the_same():
+    norm, data = learned(make_rollout()), make_rollout(1)
+    x, seen = data["observation"], data["observed"]
+    assert torch.equal(torch.vmap(norm.normalize)(x, seen), norm.normalize(x, seen))
+
+
+def make_env() -> TransformedEnv:
+    base = GymnasiumBatchEnv("InvertedPendulum-v5", 2, seed=0, max_episode_steps=9)
+    return TransformedEnv(base, Compose(ObservationMissingness("mcar", 0.5), InitTracker()))
+
+
+def test_a_collector_acts_on_what_was_learned_last():
+    norm = MaskedObservationNorm(4)
+    policy = make_policy(norm, 4)
+    collector = Collector(make_env, policy, frames_per_batch=50, total_frames=100)
+    rollouts = []
+    for data in collector:
+        rollouts.append(data.clone())
+        norm.update(data)
+    collector.shutdown()
+    then = MaskedObservationNorm(4)
+    for data in rollouts:
+        expected = then.normalize(data["observation"], data["observed"])
+        torch.testing.assert_close(data["normalized_observation"], expected)
+        then.update(data)
+
+
+@pytest.mark.slow
+def test_a_collector_in_another_process_is_sent_the_statistics():
+    norm = MaskedObservationNorm(4)
+    policy = make_policy(norm, 4)
+    collector = MultiSyncCollector(
+        [make_env], policy, frames_per_batch=50, total_frames=150, cat_results=0
+    )
+    for index, data in enumerate(collector):
+        if index:
+            expected = norm.normalize(data["observation"], data["observed"])
+            torch.testing.assert_close(data["normalized_observation"], expected)
+        norm.update(data)
+        collector.update_policy_weights_()
+    collector.shutdown()
+
+
+# ----------------------------------------------------------------------------------------- refused
+@pytest.mark.parametrize(
+    ("kwargs", "match"),
+    [
+        ({"obs_dim": 0}, "`obs_dim` must"),
+        ({"clip": -1.0}, "`clip` must"),
+        ({"eps": 0.0}, "`eps` must"),
+        ({"missing": "drop"}, "`missing` must"),
+        ({"in_keys": ["a", "b", "c"]}, "`in_keys` must name"),
+        ({"out_keys": ["observation"]}, "`out_keys` must differ"),
+    ],
+)
+def test_impossible_settings_are_refused(kwargs, match):
+    with pytest.raises(ValueError, match=match):
+        MaskedObservationNorm(**{"obs_dim": OBS, **kwargs})
+
+
+@pytest.mark.parametrize("name", ["observation", "observed"])
+def test_an_entry_that_is_not_there_is_named(name):
+    norm, data = MaskedObservationNorm(OBS), make_rollout()
+    for call in (norm, norm.update):
+        with pytest.raises(KeyError, match=f"`{name}` is not in the tensordict"):
+            call(data.exclude(name))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("observation", torch.zeros(4, 25, 5)),
+        ("observed", torch.ones(4, 25, 1).bool()),
+        ("observed", torch.ones(4, 25, OBS)),
+    ],
+)
+def test_entries_of_another_shape_or_dtype_are_refused(name, value):
+    norm, data = MaskedObservationNorm(OBS), make_rollout().set(name, value)
+    for call in (norm, norm.update):
+        with pytest.raises((ValueError, TypeError), match="must"):
+            call(data)

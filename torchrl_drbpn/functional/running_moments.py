@@ -1,0 +1,214 @@
+"""Count, mean and variance of incomplete data, batch by batch, without keeping the data.
+
+Only entries that were observed count, so every component has a count of its own. Batches are merged
+by the pairwise rule of Chan, Golub and LeVeque, which loses no precision where the mean is large
+beside the spread and gives the same result in whatever order the batches arrive. A reading that is
+far from everything else is moved to a bound before it is learned from.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["RunningMoments", "masked_moments", "merge_moments", "spread", "winsorize"]
+
+# Its square is still a float64.
+_LARGEST = 1e150
+# Learned deviations from the learned mean; beyond them a reading is moved to the bound.
+_WIDTH = 10.0
+# Readings of a component from which its learned deviation is trusted.
+_ENOUGH = 100
+# The bound before that, in deviations from the median that all but one in a thousand stay within.
+_FIRST_WIDTH = 5.0
+_FIRST_SHARE = 1000
+
+
+class RunningMoments(NamedTuple):
+    """Hold how many values were seen, their mean and their variance.
+
+    The variance instead of the sum of squares: it does not grow with the count, so that it fits
+    into float32 however long the statistics run.
+
+    Attributes:
+        n: number of observed values of each component, shape ``(*event)``.
+        mean: their mean, 0 where nothing was observed, shape ``(*event)``, units of the values.
+        var: their population variance, 0 where fewer than two were observed, shape ``(*event)``,
+            squared units.
+
+    Example:
+        >>> import torch
+        >>> empty = RunningMoments(*torch.zeros(3, 2, dtype=torch.float64))
+        >>> batch = masked_moments(torch.randn(5, 2), torch.ones(5, 2, dtype=torch.bool))
+        >>> all(torch.equal(a, b) for a, b in zip(merge_moments(empty, batch), batch))
+        True
+    """
+
+    n: Tensor
+    mean: Tensor
+    var: Tensor
+
+
+def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMoments:
+    r"""Compute the moments of the observed entries of a batch.
+
+    With `o` the mask: n = sum o,  mean = sum o x / n,  var = sum o (x - mean)^2 / n, each over the
+    first dimension. What lies under a False entry is never used, NaN and infinity included.
+
+    Args:
+        value: the samples, shape ``(samples, *event)``.
+        observed: True where an entry was observed, shape ``(samples, *event)``, bool. None: all.
+
+    Returns:
+        The moments, in float64; all 0 where nothing was observed.
+
+    Raises:
+        TypeError: ``observed`` is not bool.
+        ValueError: ``observed`` has another shape than ``value``.
+
+    Example:
+        >>> import torch
+        >>> x = torch.tensor([[1.0], [3.0], [torch.nan]])
+        >>> masked_moments(x, x.isfinite()).mean
+        tensor([2.], dtype=torch.float64)
+    """
+    if observed is None:
+        observed = torch.ones_like(value, dtype=torch.bool)
+    _check_mask(value, observed)
+    weight = observed.double()
+    count = weight.sum(0)
+    share = weight / count.clamp_min(1.0)
+    # Filled before any arithmetic, since 0 * NaN is NaN.
+    value = value.double().masked_fill(~observed, 0.0)
+    mean = (share * value).sum(0)
+    return RunningMoments(count, mean, (share * (value - mean).square()).sum(0))
+
+
+def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMoments:
+    r"""Merge the moments of two batches into those of both together.
+
+    With d = mean_b - mean_a and w = n_b / (n_a + n_b):
+    mean = mean_a + w d,  var = (1 - w) var_a + w var_b + w (1 - w) d^2.
+    Eq. (1.5) of [Chan, Golub, LeVeque 1979, Updating formulae and a pairwise algorithm for
+    computing sample variances], divided by the count.
+
+    Args:
+        first: moments of shape ``(*event)``.
+        second: moments of shape ``(*event)``.
+
+    Returns:
+        The moments of the union; neither argument is changed.
+
+    Raises:
+        ValueError: the two are of different shapes.
+
+    Example:
+        >>> import torch
+        >>> x = torch.randn(9, 2, dtype=torch.float64)
+        >>> split = merge_moments(masked_moments(x[:4]), masked_moments(x[4:]))
+        >>> torch.allclose(split.var, masked_moments(x).var)
+        True
+    """
+    shapes = {tuple(field.shape) for field in (*first, *second)}
+    if len(shapes) > 1:
+        raise ValueError(
+            "`RunningMoments` can only be merged if every field has one shape (*event), got "
+            f"{sorted(shapes)}. Are they of different sensors?"
+        )
+    count = first.n + second.n
+    # The clamp only meets a count of 0, where the weight is 0 anyway.
+    weight = second.n / count.clamp_min(1)
+    shift = second.mean - first.mean
+    between = weight * (1 - weight) * shift.square()
+    return RunningMoments(
+        count,
+        first.mean + weight * shift,
+        (1 - weight) * first.var + weight * second.var + between,
+    )
+
+
+def spread(moments: RunningMoments, eps: float) -> Tensor:
+    r"""Return the standard deviation sqrt(var + eps), and 1 where fewer than two values were seen.
+
+    One value says nothing about a spread; 1 leaves such a component on its own scale instead of
+    blowing it up.
+
+    Args:
+        moments: moments of shape ``(*event)``.
+        eps: added to the variance, squared units.
+
+    Returns:
+        The deviation, shape ``(*event)``, units of the values.
+
+    Example:
+        >>> import torch
+        >>> x = torch.randn(9, 2, dtype=torch.float64)
+        >>> torch.allclose(spread(masked_moments(x), 0.0), x.std(0, correction=0))
+        True
+    """
+    return torch.where(moments.n < 2, 1.0, (moments.var + eps).sqrt())
+
+
+def winsorize(
+    value: Tensor, observed: Tensor, learned: RunningMoments, eps: float
+) -> tuple[Tensor, Tensor]:
+    r"""Move readings that are far from all others to a bound, so that one cannot undo the rest.
+
+    A component of which 100 readings were learned, and whose variance is more than ``eps``, is
+    bounded by its learned mean plus and minus 10 learned deviations. A scale that really grows is
+    followed: the deviation can grow tenfold with each batch. Before that the batch bounds itself:
+    by its median plus and minus 5 times a deviation that only one in a thousand readings, and at
+    least one, exceeds. With fewer than three readings nothing is learned of such a component, as
+    none of them could be told from a wild one.
+
+    Args:
+        value: readings, shape ``(samples, *event)``, finite where observed.
+        observed: bool, shape ``(samples, *event)``.
+        learned: the moments so far, shape ``(*event)``.
+        eps: variance from which a component counts as one that moves, squared units.
+
+    Returns:
+        The readings, float64, and which of them to learn from.
+
+    Example:
+        >>> import torch
+        >>> nothing = RunningMoments(*torch.zeros(3, 1, dtype=torch.float64))
+        >>> x = torch.cat([torch.randn(999, 1), torch.tensor([[1e30]])])
+        >>> bounded, _ = winsorize(x, torch.ones_like(x, dtype=torch.bool), nothing, 1e-8)
+        >>> bool(bounded.max() < 30)
+        True
+    """
+    _check_mask(value, observed)
+    value = value.double().masked_fill(~observed, 0.0).clamp(-_LARGEST, _LARGEST)
+    known = (learned.n >= _ENOUGH) & (learned.var > eps)
+    centre, radius = learned.mean.double(), _WIDTH * learned.var.double().sqrt()
+    if not bool(known.all()):
+        count = observed.sum(0, keepdim=True)
+        middle = _gather(value.masked_fill(~observed, torch.inf), (count - 1) // 2)
+        distance = (middle - value).abs().neg().masked_fill(~observed, torch.inf)
+        exceeded = 1 + count // _FIRST_SHARE
+        reach = -_FIRST_WIDTH * _gather(distance, torch.minimum(exceeded, count - 1))
+        observed = observed & (known | (count >= 3))
+        centre = torch.where(known, centre, middle)
+        radius = torch.where(known, radius, reach)
+    return torch.minimum(torch.maximum(value, centre - radius), centre + radius), observed
+
+
+def _gather(value: Tensor, rank: Tensor) -> Tensor:
+    """Return the values of the given ranks along the first dimension, 0 the smallest."""
+    return value.sort(0).values.gather(0, rank.clamp_min(0)).nan_to_num(posinf=0.0)
+
+
+def _check_mask(value: Tensor, observed: Tensor) -> None:
+    if observed.dtype is not torch.bool:
+        raise TypeError(
+            f"`observed` must be bool, got {observed.dtype}. "
+            "Compare with what marks a missing entry, or call .bool()."
+        )
+    if observed.shape != value.shape:
+        raise ValueError(
+            f"`observed` must have the shape of `value` {tuple(value.shape)}, one entry for every "
+            f"component, got {tuple(observed.shape)}."
+        )
