@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import importlib.util
+
+import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-__all__ = ["TASKS", "play", "random_actions"]
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
-TASKS = [
-    f"{name}-{version}"
-    for name in [
-        "Ant",
-        "HalfCheetah",
-        "Hopper",
-        "Humanoid",
-        "InvertedDoublePendulum",
-        "InvertedPendulum",
-        "Reacher",
-        "Swimmer",
-        "Walker2d",
-    ]
-    for version in ("v4", "v5")
+__all__ = ["BACKENDS", "TASKS", "play", "random_actions"]
+
+_NAMES = (
+    "Ant HalfCheetah Hopper Humanoid InvertedDoublePendulum InvertedPendulum Reacher Swimmer "
+    "Walker2d"
+)
+TASKS = [f"{name}-{version}" for name in _NAMES.split() for version in ("v4", "v5")]
+
+_without_envpool = pytest.mark.skipif(
+    importlib.util.find_spec("envpool") is None,
+    reason="EnvPool is not installed: pip install 'torchrl-drbpn[envpool]'",
+)
+BACKENDS = [
+    pytest.param(GymnasiumBatchEnv, id="gymnasium"),
+    pytest.param(EnvPoolBatchEnv, id="envpool", marks=_without_envpool),
 ]
 
 

@@ -3,7 +3,7 @@
 from importlib.metadata import PackageNotFoundError, version
 
 from torchrl_drbpn import functional
-from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
+from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv, SimulatorError
 from torchrl_drbpn.functional import select_sensors
 from torchrl_drbpn.modules import (
     BeliefDivergedError,
@@ -58,6 +58,7 @@ __all__ = [
     "RunningReturnScale",
     "SensorOutages",
     "SensorReduction",
+    "SimulatorError",
     "functional",
     "seed_env",
     "select_sensors",

@@ -3,19 +3,19 @@
 EnvPool steps its simulators in C++ threads of its own, without the interpreter between them. It
 starts the next episode by itself when a finished simulator is stepped, and it calls an episode
 that terminates on the last step of the time limit truncated. Both are avoided here: its own time
-limit is set out of reach and kept by `BatchedSimulators`, and finished rows are reset by number.
+limit is set out of reach and kept by the batch, and finished rows are reset by number.
 """
 
 from __future__ import annotations
 
+import difflib
 from typing import Any
 
+import gymnasium
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from torchrl_drbpn.envs.batched import NO_SEED, BatchedSimulators
-from torchrl_drbpn.envs.making import check_spaces, near_ids
+from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch
 
 __all__ = ["EnvPoolBatchEnv"]
 
@@ -23,42 +23,24 @@ __all__ = ["EnvPoolBatchEnv"]
 _NO_LIMIT = 2**30
 
 
-class EnvPoolBatchEnv(BatchedSimulators):
+class EnvPoolBatchEnv(SimulatorBatch):
     r"""Step many EnvPool simulators as one TorchRL environment with batch size ``[num_envs]``.
 
-    Keys, specs and the manners of an episode's end are those of
-    :class:`~torchrl_drbpn.GymnasiumBatchEnv`: where an episode ends,
-    ``("next", "observation")`` holds its true last observation, only the rows asked for are
-    reset, and actions outside the Box are clipped to it. The package is an extra:
-    ``pip install 'torchrl-drbpn[envpool]'``; it is imported when the first object is made.
+    Arguments, keys, specs and the way an episode ends are those of
+    :class:`~torchrl_drbpn.GymnasiumBatchEnv`, with ids of EnvPool and without ``make_kwargs``; the
+    threads are EnvPool's own. The package is an extra: ``pip install 'torchrl-drbpn[envpool]'``.
 
     What differs from ``GymnasiumBatchEnv``:
 
     - EnvPool 1.2.5 carries MuJoCo 3.6, so that trajectories from equal states agree with those of
       Gymnasium on MuJoCo 4.0 closely, not exactly, and its random numbers are others: a seed gives
       other first observations. Rewards are rounded to ``float32`` inside.
-    - The seeds of EnvPool are fixed where the simulators are made. ``set_seed`` therefore makes
-      them anew at the next reset, and every row has to be reset before the next step.
+    - The seeds of EnvPool are fixed where the simulators are made. A new seed therefore makes them
+      anew at the next reset, and every row has to be reset before the next step.
     - A terminated row can not be stepped on: EnvPool would start the next episode unasked.
     - The state can not be saved: :attr:`supports_state` is False, ``state_dict()`` is empty, and
       the caller has to start new episodes. A copy or a pickle starts new episodes too.
-    - There is no rendering, and there are no keyword arguments for the task.
-
-    Args:
-        env_id: an id of EnvPool with a vector observation and a Box action, for example
-            ``"Walker2d-v5"``.
-        num_envs: number of environments, at least 1.
-
-    Keyword Args:
-        seed: seed as in ``set_seed``: sub-environment ``i`` gets the ``i``-th word of
-            ``numpy.random.SeedSequence(seed)``. Default: None, seeds from the operating system.
-        device: device of the tensors that come out. The simulators run on the CPU.
-        dtype: ``torch.float32`` or ``torch.float64``, of observations and rewards. Actions are
-            ``torch.float32``, as those of the Gymnasium tasks.
-        max_episode_steps: steps after which an episode is truncated. Default: None, as registered;
-            -1: no limit.
-        num_threads: C++ threads that step the environments while the caller waits; the results do
-            not depend on it.
+    - Resets of MuJoCo by itself can not be seen: :attr:`engine_resets` stays 0.
 
     Raises:
         ModuleNotFoundError: where EnvPool is not installed.
@@ -71,61 +53,60 @@ class EnvPoolBatchEnv(BatchedSimulators):
         >>> rollout = env.rollout(20, break_when_any_done=False)
         >>> rollout["next", "reward"].shape
         torch.Size([3, 20, 1])
-        >>> again = EnvPoolBatchEnv("InvertedPendulum-v5", 3, seed=0)
-        >>> bool((again.reset()["observation"] == rollout["observation"][:, 0]).all())
+        >>> again = env.reset(seed=0)
+        >>> bool((again["observation"] == rollout["observation"][:, 0]).all())
         True
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        num_envs: int,
-        *,
-        seed: int | None = None,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
-        max_episode_steps: int | None = None,
-        num_threads: int = 1,
-    ) -> None:
-        super().__init__(
-            env_id,
-            num_envs,
-            seed=seed,
-            device=device,
-            dtype=dtype,
-            max_episode_steps=max_episode_steps,
-            num_threads=num_threads,
-        )
-
-    # Construction ---------------------------------------------------------------------------
-
-    def _find_limit(self) -> int:
-        envpool = _import_envpool()
+    def _build(self) -> tuple[Any, Any, int | None]:
+        """Look up the sizes; the simulators are made at the first reset, when seeds are known."""
+        try:
+            import envpool
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                "`EnvPoolBatchEnv` needs EnvPool, which is not installed: "
+                "pip install 'torchrl-drbpn[envpool]'."
+            ) from error
         known = envpool.list_all_envs()
         if self.env_id not in known:
-            hint = near_ids(self.env_id, known) or "envpool.list_all_envs() names them."
-            raise ValueError(f"`env_id` must be an id of EnvPool, got {self.env_id!r}: {hint}")
-        return int(envpool.make_spec(self.env_id).config.max_episode_steps)
-
-    def _build(self) -> None:
-        """Look up the sizes; the simulators are made at the first reset, when seeds are known."""
-        spec = _import_envpool().make_spec(self.env_id)
-        observation: Any = spec.gymnasium_observation_space
-        action: Any = spec.gymnasium_action_space
-        check_spaces(self.env_id, observation, action)
-        self._obs_dim = observation.shape[0]
-        self._action_low = action.low.astype(np.float32)
-        self._action_high = action.high.astype(np.float32)
+            near = ", ".join(difflib.get_close_matches(self.env_id, known, n=4, cutoff=0.5))
+            raise ValueError(
+                f"`env_id` must be an id of EnvPool, got {self.env_id!r}: "
+                + (f"did you mean {near}?" if near else "envpool.list_all_envs() names them.")
+            )
+        spec = envpool.make_spec(self.env_id)
         self._pool: Any = None
+        self._over = np.zeros(self.num_envs, dtype=bool)
+        # Gymnasium computes contact forces in every version, EnvPool by default in v5 only: those
+        # in the observation of Humanoid-v4 would stay 0.
+        contacts = hasattr(spec.config, "post_constraint")
+        self._config = {"post_constraint": True} if contacts else {}
+        action = spec.gymnasium_action_space
+        if isinstance(action, gymnasium.spaces.Box):  # of float64 in EnvPool
+            low, high = action.low.astype(np.float32), action.high.astype(np.float32)
+            action = gymnasium.spaces.Box(low, high)
+        return spec.gymnasium_observation_space, action, int(spec.config.max_episode_steps)
+
+    def _set_seed(self, seed: int | None) -> None:
+        super()._set_seed(seed)
+        self._pool = None
+        self._started[:] = False
+
+    def _restart(
+        self, rows: NDArray[np.int64], observation: NDArray[np.float64], options: Any
+    ) -> None:
+        if options:
+            raise ValueError(f"EnvPool's simulators take no `options` at a reset, got {options}.")
+        if self._pool is None or (self._seeds[rows] != NO_SEED).any():
+            self._make_pool()
+        if len(rows):
+            observation[rows], _ = self._pool.reset(rows.astype(np.int32))
+            self._over[rows] = False
 
     def _make_pool(self) -> None:
         """Make the simulators with the pending seeds, or with fresh ones where there are none."""
-        envpool = _import_envpool()
-        config: dict[str, Any] = {}
-        if hasattr(envpool.make_spec(self.env_id).config, "post_constraint"):
-            # Gymnasium computes contact forces in every version, EnvPool by default in v5 only:
-            # those in the observation of Humanoid-v4 would stay 0.
-            config["post_constraint"] = True
+        import envpool
+
         fresh = np.random.SeedSequence().generate_state(self.num_envs)
         words = np.where(self._seeds == NO_SEED, fresh, self._seeds).astype(np.uint32)
         self._pool = envpool.make_gymnasium(
@@ -135,19 +116,9 @@ class EnvPoolBatchEnv(BatchedSimulators):
             env_seed=words.view(np.int32),
             num_threads=self.num_threads,
             max_episode_steps=_NO_LIMIT,
-            **config,
+            **self._config,
         )
-
-    def _set_seed(self, seed: int | None) -> None:
-        super()._set_seed(seed)
-        self._pool = None
-        self._forget_episodes()
-
-    # Stepping -------------------------------------------------------------------------------
-
-    def _forget_episodes(self) -> None:
-        super()._forget_episodes()
-        self._over = np.zeros(self.num_envs, dtype=bool)
+        self._over[:] = self._started[:] = False
 
     def _advance(
         self,
@@ -159,56 +130,23 @@ class EnvPoolBatchEnv(BatchedSimulators):
         truncated: NDArray[np.bool_],
     ) -> None:
         del truncated  # EnvPool's own limit is out of reach
-        over = self._over if rows is None else self._over[rows]
-        if over.any():
-            row = int(over.argmax()) if rows is None else int(rows[over][0])
+        chosen = np.arange(self.num_envs) if rows is None else rows
+        if self._over[chosen].any():
+            row = chosen[self._over[chosen]][0]
             raise RuntimeError(
                 f"`{type(self).__name__}` row {row} has terminated and was stepped on: EnvPool "
                 "would start the next episode. Reset it first, as step_and_maybe_reset does."
             )
-        if rows is None:
-            seen, gained, ended, _, _ = self._pool.step(action)
-            observation[:], reward[:, 0], terminated[:, 0] = seen, gained, ended
-            self._over = ended
-        elif len(rows):
-            seen, gained, ended, _, _ = self._pool.step(action[rows], rows)
-            observation[rows], reward[rows, 0], terminated[rows, 0] = seen, gained, ended
-            self._over[rows] = ended
-
-    def _restart(self, rows: NDArray[np.int64], observation: NDArray[np.float64]) -> None:
-        if self._pool is None:
-            self._make_pool()
-        if len(rows):
-            observation[rows], _ = self._pool.reset(rows.astype(np.int32))
-            self._over[rows] = False
-
-    # Saving and closing ---------------------------------------------------------------------
-
-    def _why_no_state(self) -> str:
-        return "EnvPool keeps its simulators and their random generators to itself"
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a pickle or a deep copy needs: everything but the simulators."""
-        state = self.__dict__.copy()
-        state["_pool"] = None
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Put the settings back; the simulators are made at the next reset."""
-        super().__setstate__(state)
-        self._forget_episodes()
+        if len(chosen):
+            numbered = () if rows is None else (rows,)
+            seen, gained, ended, _, _ = self._pool.step(action[chosen], *numbered)
+            observation[chosen], reward[chosen, 0], terminated[chosen, 0] = seen, gained, ended
+            self._over[chosen] = ended
 
     def _close_simulators(self) -> None:
         # EnvPool ends its threads where the last reference goes.
         self._pool = None
 
-
-def _import_envpool() -> Any:
-    try:
-        import envpool
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "`EnvPoolBatchEnv` needs EnvPool, which is not installed: "
-            "pip install 'torchrl-drbpn[envpool]'."
-        ) from error
-    return envpool
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a pickle or a deep copy needs: everything but the simulators."""
+        return self.__dict__ | {"_pool": None, "_started": np.zeros_like(self._started)}

@@ -1,52 +1,52 @@
-"""Many Gymnasium environments as one TorchRL environment, one TensorDict a step.
-
-A wrapper around one environment pays TorchRL's per-step Python once for every simulator step;
-this class pays it once for ``num_envs`` of them. The simulators are stepped in a plain loop into
-NumPy arrays and cross into torch once.
-"""
+"""Many Gymnasium environments as one TorchRL environment, one TensorDict a step."""
 
 from __future__ import annotations
 
+import importlib
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers import OrderEnforcing
 from numpy.typing import NDArray
 
-from torchrl_drbpn.envs.batched import NO_SEED, BatchedSimulators
-from torchrl_drbpn.envs.making import find_limit, make_simulators
-from torchrl_drbpn.envs.simulator_state import (
-    is_mujoco,
-    load_simulator_state,
-    simulator_state,
-)
+from torchrl_drbpn.envs.engine_warnings import bad_state_counters, model_warnings_once
+from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch, one_line
+from torchrl_drbpn.envs.simulator_state import is_mujoco, load_state, save_state
 
 __all__ = ["GymnasiumBatchEnv"]
 
 
-class GymnasiumBatchEnv(BatchedSimulators):
+class GymnasiumBatchEnv(SimulatorBatch):
     r"""Step many Gymnasium environments as one TorchRL environment with batch size ``[num_envs]``.
 
     The trajectories are those of ``gymnasium.make(env_id)``, bit for bit in ``float64``: the same
-    time limit, the same seeding, no change of reward or observation. There is no automatic reset
-    inside: where an episode ends, ``("next", "observation")`` holds its true last observation,
-    and TorchRL's ``step_and_maybe_reset``, ``rollout`` and collectors reset the finished rows.
-    Actions outside the Box are clipped to it before the step.
+    wrappers, time limits and seeding, no change of reward or observation. There is no automatic
+    reset inside: where an episode ends, ``("next", "observation")`` holds its true last
+    observation, and TorchRL's ``step_and_maybe_reset``, ``rollout`` and collectors reset the
+    finished rows. Actions outside the Box are clipped to it before the step.
 
-    Seeds: ``set_seed(s)`` gives sub-environment ``i`` the ``i``-th word of
+    Seeds: ``set_seed(s)`` and ``reset(seed=s)`` give sub-environment ``i`` the ``i``-th word of
     ``numpy.random.SeedSequence(s)``, so that neighbouring seeds share no sub-environment (as
     ``s + i`` would) and the first rows do not depend on ``num_envs``. The next reset of a row uses
-    its seed, once; later resets go on from there.
+    its seed, once; later resets go on from there. ``reset(options=...)`` goes to every task's own.
+
+    Faults: where MuJoCo gives up its state (it resets itself after huge velocities, and drops
+    controls that are NaN), the step is counted in :attr:`engine_resets`, a first one warns, and the
+    episode ends as truncated. A simulator that raises, or returns a reward that is not finite,
+    raises :class:`SimulatorError`.
 
     Saving: ``state_dict()`` holds the whole state of MuJoCo environments, and a run that goes on
     from it is the same to the last bit. Where :attr:`supports_state` is False it is empty, and the
     caller has to start new episodes.
 
     Args:
-        env_id: a registered Gymnasium id with a vector observation and a Box action, for example
-            ``"Walker2d-v5"``.
+        env_id: a Gymnasium id with a vector observation and a Box action, for example
+            ``"Walker2d-v5"``, or ``"module:Name-v0"`` where the module registers it.
         num_envs: number of environments, at least 1.
 
     Keyword Args:
@@ -55,7 +55,7 @@ class GymnasiumBatchEnv(BatchedSimulators):
         dtype: ``torch.float32`` or ``torch.float64``, of observations and rewards. Actions have
             the dtype of the Gymnasium action space.
         max_episode_steps: steps after which an episode is truncated. Default: None, as registered;
-            -1: no limit.
+            -1: no limit. A task's own ``TimeLimit``, in its entry point, counts in every case.
         num_threads: threads that step the environments, each its own share; the results do not
             depend on it. MuJoCo runs outside the interpreter lock, so that a second thread pays
             where a second core is free.
@@ -71,8 +71,8 @@ class GymnasiumBatchEnv(BatchedSimulators):
         >>> rollout = env.rollout(20, break_when_any_done=False)
         >>> rollout["next", "reward"].shape
         torch.Size([3, 20, 1])
-        >>> again = GymnasiumBatchEnv("InvertedPendulum-v5", 3, seed=0)
-        >>> bool((again.reset()["observation"] == rollout["observation"][:, 0]).all())
+        >>> again = env.reset(seed=0)
+        >>> bool((again["observation"] == rollout["observation"][:, 0]).all())
         True
     """
 
@@ -98,26 +98,41 @@ class GymnasiumBatchEnv(BatchedSimulators):
             max_episode_steps=max_episode_steps,
             num_threads=num_threads,
         )
+        own = self.envs[0].spec
+        if own is not None and own.max_episode_steps is not None:  # a TimeLimit inside the task
+            limits = (own.max_episode_steps, self.max_episode_steps)
+            self.max_episode_steps = min(x for x in limits if x is not None)
 
-    # Construction ---------------------------------------------------------------------------
+    # Stepping -------------------------------------------------------------------------------
 
-    def _find_limit(self) -> int | None:
-        return find_limit(self.env_id)
-
-    def _build(self) -> None:
-        """Make the Gymnasium environments and look up what the hot loop needs."""
-        self.envs = make_simulators(self.env_id, self.num_envs, self.make_kwargs)
+    def _build(self) -> tuple[Any, Any, int | None]:
+        """Make the environments, without the outermost time limit, which the batch keeps."""
+        module, _, name = self.env_id.rpartition(":")
+        try:
+            if module:
+                importlib.import_module(module)
+            limit = gymnasium.spec(name).max_episode_steps
+            with model_warnings_once():
+                self.envs = [self._make(name) for _ in range(self.num_envs)]
+        except (gymnasium.error.Error, ImportError) as error:
+            raise ValueError(
+                f"`env_id` must be a registered Gymnasium environment, got {self.env_id!r}: "
+                f"{one_line(error)}"
+            ) from error
         self._steps = [env.step for env in self.envs]
+        self._warned = [bad_state_counters(env) for env in self.envs]
         self._pool: ThreadPoolExecutor | None = None
         share = -(-self.num_envs // self.num_threads)
         starts = range(0, self.num_envs, share)
         self._shares = [range(i, min(i + share, self.num_envs)) for i in starts]
-        action: Any = self.envs[0].action_space
-        self._action_low, self._action_high = action.low, action.high
-        observation: Any = self.envs[0].observation_space
-        self._obs_dim = observation.shape[0]
+        return self.envs[0].observation_space, self.envs[0].action_space, limit
 
-    # Stepping -------------------------------------------------------------------------------
+    def _make(self, name: str) -> gymnasium.Env[Any, Any]:
+        env = gymnasium.make(
+            name, max_episode_steps=-1, disable_env_checker=True, **self.make_kwargs
+        )
+        # The batch itself refuses a step before the first reset.
+        return env.env if isinstance(env, OrderEnforcing) else env
 
     def _advance(self, rows: NDArray[np.int64] | None, *arrays: NDArray[Any]) -> None:
         if rows is not None:
@@ -125,7 +140,13 @@ class GymnasiumBatchEnv(BatchedSimulators):
         elif self.num_threads == 1:
             self._step_rows(self._shares[0], *arrays)
         else:
-            self._step_threads(*arrays)
+            # Each thread writes rows of its own, so that their order is free.
+            if self._pool is None:
+                self._pool = ThreadPoolExecutor(len(self._shares) - 1, "gymnasium-batch")
+            others = [self._pool.submit(self._step_rows, s, *arrays) for s in self._shares[1:]]
+            self._step_rows(self._shares[0], *arrays)
+            for other in others:
+                other.result()
 
     def _step_rows(
         self,
@@ -137,23 +158,47 @@ class GymnasiumBatchEnv(BatchedSimulators):
         truncated: NDArray[np.bool_],
     ) -> None:
         """Step the environments ``rows`` one after the other and write what they return."""
-        steps = self._steps
-        for i in rows:
-            observation[i], reward[i], terminated[i], truncated[i], _ = steps[i](action[i])
+        steps, warned, i = self._steps, self._warned, -1
+        try:
+            for i in rows:
+                observation[i], reward[i], terminated[i], truncated[i], _ = steps[i](action[i])
+                if any(warned[i]):
+                    truncated[i] = True
+                    self._count_engine_reset(i, reward)
+        except Exception as error:
+            self._fail(i, "raised in `step`", error)
 
-    def _step_threads(self, *arrays: NDArray[Any]) -> None:
-        """Step the shares in threads; each writes rows of its own, so their order is free."""
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(len(self._shares) - 1, "gymnasium-batch")
-        others = [self._pool.submit(self._step_rows, s, *arrays) for s in self._shares[1:]]
-        self._step_rows(self._shares[0], *arrays)
-        for other in others:
-            other.result()
+    def _count_engine_reset(self, row: int, reward: NDArray[np.float64]) -> None:
+        for k in range(len(self._warned[row])):
+            self._warned[row][k] = 0
+        if not np.isfinite(reward[row, 0]):
+            reward[row] = 0.0
+        if not self._engine_resets.any():
+            warnings.warn(
+                f"MuJoCo gave up the state of environment {row} of `{self.env_id}` after "
+                f"{self._elapsed[row]} steps (huge or NaN positions, velocities or actions): such "
+                "an episode ends as truncated; `engine_resets` counts them.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        self._engine_resets[row] += 1
 
-    def _restart(self, rows: NDArray[np.int64], observation: NDArray[np.float64]) -> None:
+    def _restart(
+        self, rows: NDArray[np.int64], observation: NDArray[np.float64], options: Any
+    ) -> None:
         for i in rows.tolist():
-            seed = int(self._seeds[i])
-            observation[i], _ = self.envs[i].reset(seed=None if seed == NO_SEED else seed)
+            seed = None if self._seeds[i] == NO_SEED else int(self._seeds[i])
+            try:
+                observation[i], _ = self.envs[i].reset(seed=seed, options=options)
+            except Exception as error:
+                self._fail(i, "raised in `reset`", error)
+
+    def _close_simulators(self) -> None:
+        for env in self.envs:
+            env.close()
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
 
     # Saving ---------------------------------------------------------------------------------
 
@@ -162,6 +207,10 @@ class GymnasiumBatchEnv(BatchedSimulators):
         """Tell whether the whole state can be saved: True for plain MuJoCo environments."""
         return all(is_mujoco(env) for env in self.envs)
 
+    def _rows_state(self) -> dict[str, NDArray[Any]]:
+        names = ("elapsed", "seeds", "started", "observation", "engine_resets")
+        return {name: getattr(self, f"_{name}") for name in names}
+
     def get_extra_state(self) -> dict[str, Any]:
         """Return the whole state as tensors: simulators, generators, clocks and pending seeds.
 
@@ -169,20 +218,15 @@ class GymnasiumBatchEnv(BatchedSimulators):
         with ``weights_only=True``.
 
         Returns:
-            ``simulators`` (see below), ``elapsed`` int64 ``(num_envs,)`` steps since the reset,
-            ``seeds`` int64 ``(num_envs,)`` seeds that the next reset uses (-1: none), ``started``
-            bool ``(num_envs,)``, and ``observation`` float64 ``(num_envs, obs)``. Empty where
-            :attr:`supports_state` is False.
+            ``simulators`` (see ``simulator_state``), ``elapsed`` int64 ``(num_envs,)`` steps since
+            the reset, ``seeds`` int64 ``(num_envs,)`` seeds that the next reset uses (-1: none),
+            ``started`` bool ``(num_envs,)``, ``observation`` float64 ``(num_envs, obs)`` and
+            ``engine_resets`` int64 ``(num_envs,)``. Empty where :attr:`supports_state` is False.
         """
         if not self.supports_state:
             return super().get_extra_state()
-        return {
-            "simulators": simulator_state(self.envs),
-            "elapsed": torch.from_numpy(self._elapsed.copy()),
-            "seeds": torch.from_numpy(self._seeds.copy()),
-            "started": torch.from_numpy(self._started.copy()),
-            "observation": torch.from_numpy(self._observation.copy()),
-        }
+        rows = {name: torch.from_numpy(array.copy()) for name, array in self._rows_state().items()}
+        return {"simulators": save_state(self.envs), **rows}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that :meth:`get_extra_state` returned; ``load_state_dict`` calls it.
@@ -191,45 +235,32 @@ class GymnasiumBatchEnv(BatchedSimulators):
             state: the tensors that :meth:`get_extra_state` returned.
 
         Raises:
-            ValueError: where the state is of another environment, another number of
-                environments, or incomplete.
+            ValueError: where the state is of another task or number of environments, or incomplete.
             RuntimeError: for a state where :attr:`supports_state` is False.
         """
         if not self.supports_state:
             super().set_extra_state(state)
             return
-        shapes = {
-            "elapsed": (self.num_envs,),
-            "seeds": (self.num_envs,),
-            "started": (self.num_envs,),
-            "observation": (self.num_envs, self._obs_dim),
-        }
-        for name, shape in shapes.items():
+        rows = self._rows_state()
+        for name, array in rows.items():
             given = tuple(state[name].shape) if name in state else "nothing"
-            if given != shape:
+            if given != array.shape:
                 raise ValueError(
-                    f"`state[{name!r}]` must have shape {shape} for {self.num_envs} x "
+                    f"`state[{name!r}]` must have shape {array.shape} for {self.num_envs} x "
                     f"{self.env_id}, got {given}: is it the state of another environment?"
                 )
         if "simulators" not in state:
             raise ValueError("`state` must hold `simulators`: is the file complete?")
-        load_simulator_state(self.envs, state["simulators"])
-        self._elapsed = state["elapsed"].cpu().numpy().astype(np.int64)
-        self._seeds = state["seeds"].cpu().numpy().astype(np.int64)
-        self._started = state["started"].cpu().numpy().astype(bool)
-        self._all_started = bool(self._started.all())
-        self._observation = state["observation"].cpu().numpy().astype(np.float64)
-
-    def _why_no_state(self) -> str:
-        return "it is not a plain MuJoCo environment"
+        load_state(self.envs, state["simulators"])
+        for name, array in rows.items():
+            array[...] = state[name].cpu().numpy()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a pickle or a deep copy needs: Gymnasium's own pickles lose the state."""
         state = self.__dict__.copy()
-        for name in ("envs", "_steps", "_pool"):
+        for name in ("envs", "_steps", "_warned", "_pool"):
             del state[name]
-        state["_saved"] = self.get_extra_state() if self.supports_state else None
-        return state
+        return state | {"_saved": self.get_extra_state()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make the simulators again and put them where they were, if their state was saved."""
@@ -237,14 +268,7 @@ class GymnasiumBatchEnv(BatchedSimulators):
         super().__setstate__(state)
         self._build()
         self.is_closed = False
-        if saved is not None:
+        if saved:
             self.set_extra_state(saved)
         else:
-            self._forget_episodes()
-
-    def _close_simulators(self) -> None:
-        for env in self.envs:
-            env.close()
-        if self._pool is not None:
-            self._pool.shutdown()
-            self._pool = None
+            self._started[:] = False

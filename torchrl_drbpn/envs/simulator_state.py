@@ -18,46 +18,18 @@ import numpy as np
 import torch
 from gymnasium.utils import seeding
 
-__all__ = ["is_mujoco", "load_simulator_state", "simulator_state"]
+__all__ = ["is_mujoco", "load_state", "save_state"]
 
 # Derived quantities of fixed size. Contacts and constraints are left out: a step makes them anew.
-_DERIVED = [
-    "qacc",
-    "xpos",
-    "xquat",
-    "xmat",
-    "xipos",
-    "ximat",
-    "xanchor",
-    "xaxis",
-    "geom_xpos",
-    "geom_xmat",
-    "site_xpos",
-    "site_xmat",
-    "cam_xpos",
-    "cam_xmat",
-    "light_xpos",
-    "light_xdir",
-    "subtree_com",
-    "subtree_linvel",
-    "subtree_angmom",
-    "cdof",
-    "cinert",
-    "cvel",
-    "cacc",
-    "cfrc_int",
-    "cfrc_ext",
-    "qfrc_actuator",
-    "qfrc_passive",
-    "qfrc_bias",
-    "qfrc_smooth",
-    "qfrc_constraint",
-    "qacc_smooth",
-    "actuator_length",
-    "actuator_velocity",
-    "actuator_force",
-    "sensordata",
-]
+# fmt: off
+_DERIVED = (
+    "qacc", "xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos",
+    "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir",
+    "subtree_com", "subtree_linvel", "subtree_angmom", "cdof", "cinert", "cvel", "cacc", "cfrc_int",
+    "cfrc_ext", "qfrc_actuator", "qfrc_passive", "qfrc_bias", "qfrc_smooth", "qfrc_constraint",
+    "qacc_smooth", "actuator_length", "actuator_velocity", "actuator_force", "sensordata",
+)
+# fmt: on
 
 
 def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:
@@ -81,7 +53,7 @@ def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:
     return isinstance(env, MujocoEnv)
 
 
-def simulator_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
+def save_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
     """Return the whole state of MuJoCo environments as tensors.
 
     Args:
@@ -98,24 +70,23 @@ def simulator_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
     physics = np.empty((len(envs), mujoco.mj_stateSize(envs[0].model, what)))
     for env, row in zip(envs, physics, strict=True):
         mujoco.mj_getState(env.model, env.data, row, what)
-    derived = np.stack([_derived(env.data) for env in envs])
+    derived = [np.concatenate([field.ravel() for field in _derived(env.data)]) for env in envs]
     held = [
         {"generator": env.np_random.bit_generator.state, "numbers": _numbers(env)} for env in envs
     ]
-    text = json.dumps(held).encode()
     return {
         "physics": torch.from_numpy(physics),
-        "derived": torch.from_numpy(derived),
-        "generators": torch.frombuffer(bytearray(text), dtype=torch.uint8),
+        "derived": torch.from_numpy(np.stack(derived)),
+        "generators": torch.frombuffer(bytearray(json.dumps(held).encode()), dtype=torch.uint8),
     }
 
 
-def load_simulator_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) -> None:
-    """Put MuJoCo environments into a state that :func:`simulator_state` returned.
+def load_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) -> None:
+    """Put MuJoCo environments into a state that :func:`save_state` returned.
 
     Args:
         envs: MuJoCo environments of the same task, without wrappers.
-        state: the tensors that :func:`simulator_state` returned.
+        state: the tensors that :func:`save_state` returned.
 
     Raises:
         ValueError: where the state is of another task or incomplete.
@@ -123,25 +94,25 @@ def load_simulator_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) ->
     Examples:
         >>> env = gymnasium.make("Hopper-v5").unwrapped
         >>> _ = env.reset(seed=0)
-        >>> saved, action = simulator_state([env]), np.ones(3)
+        >>> saved, action = save_state([env]), np.ones(3)
         >>> first = env.step(action)[0]
-        >>> load_simulator_state([env], saved)
+        >>> load_state([env], saved)
         >>> bool((env.step(action)[0] == first).all())
         True
     """
     import mujoco
 
     what = mujoco.mjtState.mjSTATE_INTEGRATION
-    shapes = {
-        "physics": (len(envs), mujoco.mj_stateSize(envs[0].model, what)),
-        "derived": (len(envs), _derived(envs[0].data).size),
+    sizes = {
+        "physics": mujoco.mj_stateSize(envs[0].model, what),
+        "derived": sum(field.size for field in _derived(envs[0].data)),
     }
-    for name, shape in shapes.items():
+    for name, size in sizes.items():
         given = tuple(state[name].shape) if name in state else "nothing"
-        if given != shape:
+        if given != (len(envs), size):
             raise ValueError(
-                f"`{name}` must have shape {shape}, got {given}: is it the state of another task, "
-                "number of environments or MuJoCo version?"
+                f"`{name}` must have shape {(len(envs), size)}, got {given}: is it the state of "
+                "another task, number of environments or MuJoCo version?"
             )
     try:
         held = json.loads(bytes(state["generators"].cpu().numpy()))
@@ -156,7 +127,9 @@ def load_simulator_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) ->
         mujoco.mj_setState(env.model, env.data, numbers, what)
         mujoco.mj_forward(env.model, env.data)
         mujoco.mj_setState(env.model, env.data, numbers, what)
-        _set_derived(env.data, values)
+        for field in _derived(env.data):
+            field[...] = values[: field.size].reshape(field.shape)
+            values = values[field.size :]
         env.np_random, _ = seeding.np_random(0)
         env.np_random.bit_generator.state = own["generator"]
         for name, (value, dtype) in own["numbers"].items():
@@ -164,16 +137,8 @@ def load_simulator_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) ->
             setattr(env, name, value if dtype is None else np.array(value, dtype=dtype)[()])
 
 
-def _derived(data: Any) -> Any:
-    return np.concatenate([getattr(data, name).ravel() for name in _DERIVED])
-
-
-def _set_derived(data: Any, values: Any) -> None:
-    start = 0
-    for name in _DERIVED:
-        field = getattr(data, name)
-        field[...] = values[start : start + field.size].reshape(field.shape)
-        start += field.size
+def _derived(data: Any) -> list[Any]:
+    return [getattr(data, name) for name in _DERIVED]
 
 
 def _numbers(env: Any) -> dict[str, tuple[Any, str | None]]:

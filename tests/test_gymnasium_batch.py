@@ -1,0 +1,373 @@
+"""Specification of what `GymnasiumBatchEnv` alone promises, beside test_envs.py.
+
+Its trajectories are those of `gymnasium.make`, to the last bit, wrappers and time limits included;
+a saved state goes on to the last bit in a fresh object; a simulator that fails is named, and one
+whose physics engine resets itself is counted and ends its episode.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from env_tools import TASKS, play, random_actions
+from gymnasium import spaces
+from torchrl.envs import ParallelEnv, check_env_specs
+
+from torchrl_drbpn import EnvPoolBatchEnv, GymnasiumBatchEnv, SimulatorError
+
+# Version 4 is tested on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date")
+
+VECTOR = spaces.Box(-1, 1, (3,), np.float32)
+IMAGE = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+
+@pytest.fixture(autouse=True)
+def _own_directory(tmp_path, monkeypatch):
+    # MuJoCo writes the warnings of a model file into the current directory.
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """Register a task for one test."""
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
+
+    def add(entry_point, **kwargs):
+        gymnasium.register("ForTest-v0", entry_point=entry_point, **kwargs)
+        return "ForTest-v0"
+
+    return add
+
+
+class Counter(gymnasium.Env):
+    """Count steps; fail, or return the reward NaN, where asked."""
+
+    def __init__(self, observation=VECTOR, action=VECTOR, fails="", at=3):
+        self.observation_space, self.action_space = observation, action
+        self.fails, self.at, self.time = fails, at, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if self.fails == "reset":
+            raise OSError("the cable\nis out")
+        self.time = (options or {}).get("time", 0)
+        return np.full(3, self.time, np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        if self.time == self.at and self.fails == "step":
+            raise ZeroDivisionError("a joint has no mass")
+        reward = float(self.fails) if self.time == self.at and self.fails in ("nan", "inf") else 1.0
+        return np.full(3, self.time, np.float32), reward, False, False, {}
+
+
+# The same trajectories as Gymnasium's ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_trajectories_are_those_of_gymnasium_to_the_last_bit(env_id):
+    steps, n, limit = 60, 2, 25
+    env = GymnasiumBatchEnv(env_id, n, seed=3, dtype=torch.float64, max_episode_steps=limit)
+    actions = random_actions(env, steps, scale=1.5)
+    tensordict = env.reset()
+    seen, _ = play(env, tensordict.clone(), actions)
+
+    for row, seed in enumerate(np.random.SeedSequence(3).generate_state(n)):
+        by_hand = gymnasium.make(env_id, max_episode_steps=limit)
+        space = by_hand.action_space
+        observation, _ = by_hand.reset(seed=int(seed))
+        np.testing.assert_array_equal(tensordict["observation"][row], observation)
+        for step in range(steps):
+            action = np.clip(actions[step, row].numpy(), space.low, space.high)
+            observation, reward, terminated, truncated, _ = by_hand.step(action)
+            after = by_hand.reset()[0] if terminated or truncated else observation
+            expected = np.concatenate([observation, [reward, terminated, truncated], after])
+            np.testing.assert_array_equal(seen[step, row], expected)
+
+
+def test_float32_is_the_rounded_float64():
+    single, double = (
+        GymnasiumBatchEnv("Walker2d-v5", 2, seed=0, dtype=dtype)
+        for dtype in (torch.float32, torch.float64)
+    )
+    actions = random_actions(single, 20)
+    low, _ = play(single, single.reset(), actions)
+    high, _ = play(double, double.reset(), actions)
+    torch.testing.assert_close(low, high.float().double(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("own", "registered", "asked", "expected"),
+    [
+        (4, None, None, 4),
+        (4, 7, None, 4),
+        (7, 4, None, 4),
+        (7, None, 5, 5),
+        (4, 7, -1, 4),
+        (None, 6, None, 6),
+        (None, 6, -1, None),
+    ],
+)
+def test_the_shortest_time_limit_counts_as_in_gymnasium(register, own, registered, asked, expected):
+    def make():
+        env = Counter()
+        return env if own is None else gymnasium.wrappers.TimeLimit(env, own)
+
+    env_id = register(make, max_episode_steps=registered)
+    by_hand = gymnasium.make(env_id, max_episode_steps=asked)
+    by_hand.reset()
+    ends = [by_hand.step(np.zeros(3, np.float32))[3] for _ in range(9)]
+    env = GymnasiumBatchEnv(env_id, 2, max_episode_steps=asked)
+    assert env.max_episode_steps == expected
+    truncated = env.rollout(9)["next", "truncated"][0, :, 0].tolist()
+    assert truncated == ends[: len(truncated)]
+    assert True in truncated or expected is None
+
+
+def test_wrappers_of_a_task_and_its_keywords_are_kept(register):
+    scale = gymnasium.wrappers.TransformReward.wrapper_spec(func=_doubled)
+    env_id = register(Counter, additional_wrappers=(scale,))
+    assert (GymnasiumBatchEnv(env_id, 2).rollout(3)["next", "reward"] == 2).all()
+    env = GymnasiumBatchEnv("Walker2d-v5", 2, frame_skip=2, render_mode="rgb_array")
+    assert [sim.unwrapped.frame_skip for sim in env.envs] == [2, 2]
+    assert [sim.render_mode for sim in env.envs] == ["rgb_array", "rgb_array"]
+
+
+def _doubled(reward):
+    return 2 * reward
+
+
+def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch, register):
+    text = "import gymnasium\ngymnasium.register('Mine-v0', 'test_gymnasium_batch:Counter')\n"
+    (tmp_path / "robots_for_test.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert GymnasiumBatchEnv("robots_for_test:Mine-v0", 2).rollout(3).shape == (2, 3)
+    with pytest.raises(ValueError, match=r"`env_id`.*no_such_module"):
+        GymnasiumBatchEnv("no_such_module:Mine-v0", 2)
+
+
+def test_reset_passes_options_on_to_the_rows_it_resets(register):
+    env = GymnasiumBatchEnv(register(Counter), 2)
+    env.reset()
+    mask = torch.tensor([[True], [False]])
+    after = env.reset(env.reset().set("_reset", mask), options={"time": 5})
+    assert after["observation"][:, 0].tolist() == [5, 0]
+
+
+def test_a_seeded_partial_reset_gives_the_rows_what_a_whole_one_does():
+    env = GymnasiumBatchEnv("Swimmer-v5", 3, seed=0)
+    first = env.reset()["observation"]
+    later = env.reset()
+    again = env.reset(later.clone().set("_reset", torch.tensor([[False], [True], [False]])), seed=0)
+    assert torch.equal(again["observation"][1], first[1])
+    assert torch.equal(again["observation"][::2], later["observation"][::2])
+
+
+def test_making_writes_no_log_file_and_says_each_model_warning_once(tmp_path, caplog):
+    with caplog.at_level("INFO"):
+        GymnasiumBatchEnv("HalfCheetah-v5", 3)
+    assert not any(tmp_path.iterdir())
+    assert sum("settotalmass" in record.message for record in caplog.records) <= 1
+
+
+# Faults ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(
+    ("fails", "match"),
+    [
+        ("step", "raised in `step` after 2 steps .*ZeroDivisionError: a joint has no mass"),
+        ("nan", "returned the reward nan in `step` after 2 steps"),
+        ("inf", "returned the reward inf in `step` after 2 steps"),
+    ],
+)
+def test_a_simulator_that_fails_is_named_with_its_step_in_one_line(register, threads, fails, match):
+    env = GymnasiumBatchEnv(register(Counter), 3, num_threads=threads)
+    env.envs[2].unwrapped.fails = fails
+    with pytest.raises(SimulatorError, match=f"environment 2 of 3 x `ForTest-v0` {match}") as error:
+        env.rollout(5)
+    assert "\n" not in str(error.value)
+
+
+def test_a_simulator_that_fails_in_reset_is_named_in_one_line(register):
+    env = GymnasiumBatchEnv(register(Counter), 2)
+    env.envs[1].unwrapped.fails = "reset"
+    match = "environment 1 .* raised in `reset` after 0 steps .*: OSError: the cable is out$"
+    with pytest.raises(SimulatorError, match=match):
+        env.reset()
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "InvertedPendulum-v5"])
+@pytest.mark.parametrize("fault", ["velocity", "position", "action"])
+def test_an_engine_that_resets_itself_is_counted_and_ends_the_episode_as_truncated(env_id, fault):
+    env = GymnasiumBatchEnv(env_id, 2, seed=0)
+    root = env.reset()
+    for _ in range(3):
+        root = env.step(root.set("action", torch.zeros_like(env.action_spec.zero())))["next"]
+    action = env.action_spec.zero()
+    if fault == "action":
+        action[1] = torch.nan
+    else:
+        data = env.envs[1].data
+        (data.qvel if fault == "velocity" else data.qpos)[0] = 1e12
+    with pytest.warns(RuntimeWarning, match=f"environment 1 of `{env_id}` after 3 steps"):
+        stepped, root = env.step_and_maybe_reset(root.set("action", action))
+    assert stepped["next", "truncated"].flatten().tolist() == [False, True]
+    assert stepped["next", "reward"].isfinite().all()
+    assert env.engine_resets.tolist() == [0, 1]
+    root = env.step(root.set("action", env.action_spec.zero()))
+    assert not root["next", "truncated"].any()
+    assert env.engine_resets.tolist() == [0, 1]
+
+
+# Saving ----------------------------------------------------------------------------------------
+
+
+def through_a_file(state):
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=True)
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_a_restored_run_goes_on_to_the_last_bit_in_a_fresh_object(env_id):
+    kwargs = {"dtype": torch.float64, "max_episode_steps": 70}
+    env = GymnasiumBatchEnv(env_id, 2, seed=0, **kwargs)
+    actions = random_actions(env, 160)
+    _, tensordict = play(env, env.reset(), actions[:40])
+    saved, start = through_a_file(env.state_dict()), tensordict.clone()
+    expected, _ = play(env, tensordict, actions[40:])
+    assert expected[:, :, -1].isfinite().all()
+
+    fresh = GymnasiumBatchEnv(env_id, 2, seed=99, **kwargs)
+    play(fresh, fresh.reset(), actions[:7])  # a past of its own must leave no trace
+    fresh.load_state_dict(saved)
+    again, _ = play(fresh, start.clone(), actions[40:])
+    torch.testing.assert_close(again, expected, rtol=0, atol=0)
+
+    never_reset = GymnasiumBatchEnv(env_id, 2, **kwargs)
+    never_reset.load_state_dict(saved)
+    again, _ = play(never_reset, start.clone(), actions[40:80])
+    torch.testing.assert_close(again, expected[:40], rtol=0, atol=0)
+
+
+def test_saving_does_not_disturb_the_run():
+    plain, saved = (GymnasiumBatchEnv("Ant-v5", 2, seed=0) for _ in "ab")
+    actions = random_actions(plain, 20)
+    expected, _ = play(plain, plain.reset(), actions)
+    tensordict, parts = saved.reset(), []
+    for action in actions:
+        part, tensordict = play(saved, tensordict, [action])
+        saved.state_dict()
+        parts.append(part)
+    torch.testing.assert_close(torch.cat(parts), expected, rtol=0, atol=0)
+
+
+def test_a_pending_seed_is_saved():
+    env = GymnasiumBatchEnv("Swimmer-v5", 2, seed=0)
+    fresh = GymnasiumBatchEnv("Swimmer-v5", 2, seed=1)
+    fresh.load_state_dict(env.state_dict())
+    torch.testing.assert_close(fresh.reset()["observation"], env.reset()["observation"])
+
+
+def test_numbers_that_a_task_holds_are_saved():
+    env = GymnasiumBatchEnv("Reacher-v5", 1, seed=0)
+    env.reset()
+    env.envs[0].count, env.envs[0].level = 3, np.float64(0.1)
+    fresh = GymnasiumBatchEnv("Reacher-v5", 1)
+    fresh.load_state_dict(through_a_file(env.state_dict()))
+    np.testing.assert_array_equal(fresh.envs[0].goal, env.envs[0].goal)
+    assert fresh.envs[0].count == 3
+    assert isinstance(fresh.envs[0].level, np.float64)
+    assert fresh.envs[0].level == 0.1
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_where_the_original_is(duplicate):
+    env = GymnasiumBatchEnv("Hopper-v5", 2, seed=0, num_threads=2)
+    actions = random_actions(env, 30)
+    _, tensordict = play(env, env.reset(), actions[:10])
+    twin = duplicate(env)
+    expected, _ = play(env, tensordict.clone(), actions[10:])
+    again, _ = play(twin, tensordict.clone(), actions[10:])
+    torch.testing.assert_close(again, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(("env_id", "n"), [("Walker2d-v5", 2), ("Hopper-v5", 3)])
+def test_a_foreign_state_is_refused(env_id, n):
+    env = GymnasiumBatchEnv("Hopper-v5", 2, seed=0)
+    env.reset()
+    other = GymnasiumBatchEnv(env_id, n)
+    with pytest.raises(ValueError, match="another environment"):
+        other.load_state_dict(env.state_dict())
+
+
+@pytest.mark.parametrize("key", ["elapsed", "observation", "simulators", "generators"])
+def test_an_incomplete_or_damaged_state_is_refused(key):
+    env = GymnasiumBatchEnv("Hopper-v5", 2, seed=0)
+    env.reset()
+    state = env.state_dict()
+    extra = state["_extra_state"]
+    if key == "generators":
+        extra["simulators"][key] = extra["simulators"][key][:-9]
+    else:
+        del extra[key]
+    with pytest.raises(ValueError, match=key):
+        env.load_state_dict(state)
+
+
+def test_a_task_without_mujoco_says_that_it_can_not_be_saved():
+    env = GymnasiumBatchEnv("Pendulum-v1", 2, seed=0)
+    check_env_specs(env)
+    assert not env.supports_state
+    assert not any(env.state_dict().values())
+    other = GymnasiumBatchEnv("InvertedPendulum-v5", 2, seed=0)
+    other.reset()
+    with pytest.raises(RuntimeError, match=r"can not be restored.*supports_state"):
+        env.load_state_dict(other.state_dict())
+
+
+def test_a_task_that_can_not_be_saved_runs_in_parallel_environments():
+    # TorchRL asks a shadow of each worker's environment for its state_dict.
+    env = ParallelEnv(2, lambda: GymnasiumBatchEnv("Pendulum-v1", 3, seed=0))
+    try:
+        assert env.rollout(3)["observation"].shape == (2, 3, 3, 3)
+    finally:
+        env.close(raise_if_closed=False)
+
+
+# Errors ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "match"),
+    [
+        (IMAGE, VECTOR, r"observation space .* got Box\(0, 255, \(8, 8, 3\), uint8\)"),
+        (spaces.Box(0, 9, (3,), np.int64), VECTOR, r"observation space .* got Box.*int64"),
+        (spaces.Dict(a=VECTOR), VECTOR, r"observation space .* got Dict\('a'"),
+        (VECTOR, spaces.Discrete(3), r"action space .* got Discrete\(3\)"),
+        (VECTOR, spaces.MultiDiscrete([2, 3]), r"action space .* got MultiDiscrete"),
+        (VECTOR, spaces.Box(-np.inf, np.inf, (2,), np.float32), "action space .* finite limits"),
+    ],
+)
+def test_spaces_that_are_not_vectors_are_refused_by_name(register, observation, action, match):
+    env_id = register(Counter, kwargs={"observation": observation, "action": action})
+    with pytest.raises(ValueError, match=match) as error:
+        GymnasiumBatchEnv(env_id, 1)
+    assert "\n" not in str(error.value)
+
+
+def test_the_environment_over_envpool_names_its_extra_where_envpool_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchrl-drbpn\[envpool\]'"):
+        EnvPoolBatchEnv("Walker2d-v5", 2)

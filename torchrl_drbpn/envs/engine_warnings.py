@@ -1,0 +1,73 @@
+"""What MuJoCo warns of: models with faults, and states that it gives up in the middle of a run."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, MutableSequence
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+
+__all__ = ["bad_state_counters", "model_warnings_once"]
+
+_log = logging.getLogger(__name__)
+
+
+def bad_state_counters(env: gymnasium.Env[Any, Any]) -> MutableSequence[int]:
+    """Return MuJoCo's own counters of states that it gave up since the last reset.
+
+    MuJoCo resets itself where positions, velocities or accelerations are huge or NaN, and drops
+    controls that are NaN; the simulation then goes on from a state that nobody asked for.
+
+    Args:
+        env: an environment, wrapped or not.
+
+    Returns:
+        A view on the counters; empty where the environment is not MuJoCo's.
+
+    Examples:
+        >>> env = gymnasium.make("InvertedPendulum-v5")
+        >>> _ = env.reset(seed=0)
+        >>> env.unwrapped.data.qvel[:] = 1e12
+        >>> counters = bad_state_counters(env)
+        >>> any(counters)
+        False
+        >>> _ = env.step([0.0])
+        >>> any(counters)
+        True
+    """
+    data = getattr(env.unwrapped, "data", None)
+    try:
+        import mujoco
+    except ImportError:  # not every Gymnasium task needs it
+        return []
+    if not isinstance(data, mujoco.MjData):
+        return []
+    # The four of interest are the last ones; memoryviews are read ten times faster than arrays.
+    first = int(mujoco.mjtWarning.mjWARN_BADQPOS)
+    counters: Any = memoryview(data.warning.number[first:])
+    return counters
+
+
+@contextmanager
+def model_warnings_once() -> Iterator[None]:
+    """Log each warning about a model file once.
+
+    MuJoCo prints them, and appends them to a file in the current directory, once for every
+    simulator made: HalfCheetah's model has one in MuJoCo 4.0.
+    """
+    try:
+        import mujoco
+    except ImportError:  # not every Gymnasium task needs it
+        yield
+        return
+    messages: dict[str, None] = {}
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: messages.update({text: None}))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
+        for text in messages:
+            _log.info("MuJoCo: %s", text)
