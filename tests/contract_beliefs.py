@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import (
     Compose,
     DoubleToFloat,
@@ -27,7 +28,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
-from torchrl.modules import set_recurrent_mode
+from torchrl.modules import GRUModule, canonicalize_rnn_subset, set_recurrent_mode
 from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_drbpn import GymnasiumBatchEnv, ObservationMissingness, PreviousAction
@@ -66,14 +67,17 @@ def with_belief_entries(
 class BeliefModuleContract(BeliefFrames):
     """Duties of a belief module: what `GRUModule` does in a TorchRL pipeline, and the age rule.
 
-    `is_init & (age == 0)` starts from the module's own beginning; `is_init` with an older age takes
-    the stored state; without `is_init` the state is carried on.
+    One step at a time `is_init` starts from the module's own beginning. Over time `is_init & (age
+    == 0)` does, and `is_init` with an older age takes the stored state; without `is_init` the state
+    is carried on.
 
     Attributes:
         age_key: the root entry that counts updates since the reset.
+        all_outputs: every entry that the module can write.
     """
 
     age_key: Any = ("recurrent", "age")
+    all_outputs: Any = None
 
     # --- hooks
     def make_module(
@@ -98,21 +102,31 @@ class BeliefModuleContract(BeliefFrames):
             assert sequence[key].dtype == rollout[key].dtype, key
 
     def test_keys_can_be_renamed_nested_ones_included(self):
-        plain = self.make_module()
-        named = self.make_module(
-            in_keys={"observation": ("agent", "observation"), "is_init": "first"},
-            out_keys={"features": ("agent", "embed")},
-        )
-        frames = self.make_frames((3, 4))
-        frames["is_init"][:, 0] = True
+        plain, names = self.make_module(), {"observation": ("agent", "observation"), "is_init": "i"}
+        named = self.make_module(in_keys=names, out_keys={"features": ("agent", "embed")})
+        short = self.make_module(in_key=("agent", "observation"), out_key=("agent", "embed"))
+        frames = self.one_by_one(plain, self.make_frames((3, 4)), self.some_state(plain, (3,)))
+        expected = self.as_sequence(plain, frames)["features"]
+        frames.rename_key_("observation", ("agent", "observation"))
         with set_recurrent_mode(True):
-            expected = plain(frames.clone())["features"]
-            renamed = frames.clone()
-            renamed.rename_key_("observation", ("agent", "observation"))
-            renamed.rename_key_("is_init", "first")
-            received = named(renamed)
-        assert torch.equal(received["agent", "embed"], expected)
-        assert "features" not in received
+            shortened = short(frames.clone())
+            renamed = named(frames.exclude("features").rename_key_("is_init", "i"))
+        assert torch.equal(renamed["agent", "embed"], expected)
+        assert torch.equal(shortened["agent", "embed"], expected)
+        assert "features" not in renamed
+
+    @pytest.mark.parametrize("over_time", [False, True])
+    def test_a_mask_declared_absent_is_all_true_and_an_action_zero(self, over_time):
+        module = self.make_module()
+        frames = self.make_frames((2, 3))
+        frames["observed"][:], frames["previous_action"][:] = True, 0.0
+        data = self.one_by_one(module, frames, self.some_state(module, (2,)))
+        data = data.select(*module.in_keys)
+        without = self.make_module(in_keys={"observed": None, "previous_action": None})
+        assert len(without.in_keys) == len(module.in_keys) - 2
+        with set_recurrent_mode(over_time):
+            expected = module(data.clone())
+            self.assert_same(module, without(data.select(*without.in_keys)), expected)
 
     def test_dispatch_takes_tensors_by_name(self):
         module = self.make_module()
@@ -137,30 +151,24 @@ class BeliefModuleContract(BeliefFrames):
         assert out.batch_size == torch.Size(shape)
         self.assert_same(module, out.reshape(-1), each[:count])
 
-    @pytest.mark.parametrize("shape", [(), (2,), (2, 3), (2, 3, 2)])
-    def test_a_sequence_takes_any_number_of_leading_dimensions(self, shape):
-        module = self.make_module()
-        count = torch.Size(shape).numel()
-        frames = self.make_frames((count, 5))
-        frames["is_init"][:, 0] = True
-        rollout = self.one_by_one(module, frames, None)
-        out = self.as_sequence(module, rollout.reshape(*shape, 5))
-        assert out.batch_size == (*shape, 5)
-        self.assert_same(module, out.reshape(count, 5), rollout)
-
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("shape", [(), (3,), (2, 3), (2, 3, 2)])
     @pytest.mark.parametrize("start", ["episode start", "mid-episode"])
-    def test_step_by_step_equals_the_whole_sequence(self, dtype, start):
+    def test_step_by_step_equals_the_whole_sequence(self, dtype, shape, start):
         module = self.make_module(dtype=dtype)
-        frames = self.make_frames((4, 12), dtype)
-        frames["is_init"][1, 5] = True
-        frames["is_init"][2, [3, 4, 9]] = True
-        if start == "episode start":
-            frames["is_init"][:, 0] = True
-        state = None if start == "episode start" else self.some_state(module, (4,))
+        count = torch.Size(shape).numel()
+        frames = self.make_frames((count, 12), dtype)
+        frames["is_init"][0, 5] = True
+        frames["is_init"][-1, [3, 4, 9]] = True
+        frames["is_init"][:, 0] = start == "episode start"
+        state = None if start == "episode start" else self.some_state(module, (count,))
         rollout = self.one_by_one(module, frames, state)
         assert rollout["features"].dtype == dtype
-        self.assert_same(module, self.as_sequence(module, rollout), rollout)
+        strided = rollout.transpose(0, 1).contiguous().transpose(0, 1)
+        assert count == 1 or not strided["observation"].is_contiguous()
+        out = self.as_sequence(module, strided.reshape(*shape, 12))
+        assert out.batch_size == (*shape, 12)
+        self.assert_same(module, out.reshape(count, 12), rollout)
 
     def test_a_reset_inside_a_row_equals_two_sequences(self):
         module = self.make_module(dtype=torch.float64)
@@ -189,7 +197,7 @@ class BeliefModuleContract(BeliefFrames):
             self.as_sequence(module, other)["features"][:, 0], rollout["features"][:, 5]
         )
 
-    def test_is_init_with_an_older_age_loads_the_stored_state(self):
+    def test_is_init_with_an_older_age_is_a_seam_over_time_and_a_reset_one_step_at_a_time(self):
         # two slices of one episode in one row, as TorchRL's SliceSampler lays them out
         module = self.make_module(dtype=torch.float64)
         frames = self.make_frames((2, 12), torch.float64)
@@ -202,7 +210,12 @@ class BeliefModuleContract(BeliefFrames):
         expected = torch.cat([rollout[:, 2:5], rollout[:, 8:12]], 1)
         assert (stitched[self.age_key][:, [0, 3]] > 0).all()
         self.assert_same(module, self.as_sequence(module, stitched), expected)
-        self.assert_same(module, module(stitched.select(*module.in_keys)), expected)
+        seam = stitched[:, 3].select(*module.in_keys)
+        alone = module(seam.clone())
+        assert alone["next"][self.age_key].eq(1).all()
+        for key in self.state_keys(module):
+            seam[key].zero_()
+        self.assert_same(module, alone, module(seam))
 
     def test_an_episode_start_ignores_whatever_state_is_stored(self):
         module = self.make_module()
@@ -224,41 +237,35 @@ class BeliefModuleContract(BeliefFrames):
         assert rollout[self.age_key].flatten().tolist() == [0, 1, 2, 3, 0, 1]
         following = rollout["next"][self.age_key].flatten()
         assert following.tolist() == [1, 2, 3, 4, 1, 2]
-        # without stored entries a sequence counts for itself
-        with set_recurrent_mode(True):
-            fresh = module(frames.clone())
-        assert torch.equal(fresh["next"][self.age_key].flatten(), following)
 
-    def test_sequences_without_recurrent_entries_begin_at_the_beginning(self):
+    @pytest.mark.parametrize("over_time", [False, True])
+    def test_without_recurrent_entries_rows_begin_at_the_beginning_and_one_warning_says_so(
+        self, over_time
+    ):
         module = self.make_module()
         frames = self.make_frames((3, 6))
         frames["is_init"][1, 3] = True
-        with set_recurrent_mode(True), warnings.catch_warnings():
-            warnings.simplefilter("error")
-            received = module(frames.clone())
-        frames["is_init"][:, 0] = True
-        self.assert_same(module, received, self.one_by_one(module, frames, None))
-
-    def test_single_steps_without_recurrent_entries_warn_once(self):
-        module = self.make_module()
-        step = self.make_frames((3,))
-        with pytest.warns(UserWarning, match=r"make_tensordict_primer\(\)"):
-            received = module(step.clone())
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            module(step.clone())
-        step["is_init"][:] = True
-        expected = self.one_by_one(module, step.unsqueeze(-1), None)[:, 0]
+        with set_recurrent_mode(over_time):
+            with pytest.warns(UserWarning, match=r"make_tensordict_primer\(\)"):
+                received = module(frames.clone())
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                module(frames.clone())
+        frames["is_init"][:, slice(0, 1 if over_time else None)] = True
+        expected = self.one_by_one(module, frames, None)
         self.assert_same(module, received, expected)
+        assert torch.equal(received["next"][self.age_key], expected["next"][self.age_key])
 
-    def test_non_contiguous_input_gives_the_same(self):
+    @pytest.mark.parametrize("over_time", [False, True])
+    def test_a_part_of_the_recurrent_state_is_an_error_that_names_the_rest(self, over_time):
         module = self.make_module()
-        frames = self.make_frames((3, 6))
-        frames["is_init"][:, 0] = True
-        rollout = self.one_by_one(module, frames, None)
-        strided = rollout.transpose(0, 1).contiguous().transpose(0, 1)
-        assert not strided["observation"].is_contiguous()
-        self.assert_same(module, self.as_sequence(module, strided), rollout)
+        rollout = self.one_by_one(module, self.make_frames((3, 2)), None)
+        data = rollout.select(*module.in_keys).exclude(self.age_key)
+        with (
+            set_recurrent_mode(over_time),
+            pytest.raises(KeyError, match=r"'recurrent', 'age'.*make_tensordict_primer\(\)"),
+        ):
+            module(data)
 
     def test_what_was_read_is_left_as_it_was(self):
         module = self.make_module()
@@ -270,22 +277,19 @@ class BeliefModuleContract(BeliefFrames):
             assert torch.equal(after[key], before[key]), key
 
     # --- modes
-    def test_the_mode_is_a_context_or_a_default(self):
-        module = self.make_module(default_recurrent_mode=True)
-        plain = self.make_module()
-        frames = self.make_frames((3, 6))
-        frames["is_init"][:, 0] = True
-        rollout = self.one_by_one(plain, frames, None)
-        # over time and step by step agree only if the first really ran over time
-        dirty = rollout.select(*module.in_keys)
-        for key in self.state_keys(module):
-            if dirty[key].is_floating_point():
-                dirty[key][:, 1:] = 7.0
-        self.assert_same(module, module(dirty.clone()), rollout)
-        with set_recurrent_mode(False):
-            single = module(dirty.clone())["features"]
-        assert not torch.allclose(single[:, 1:], rollout["features"][:, 1:])
-        assert torch.equal(plain(dirty.clone())["features"], single)
+    @pytest.mark.parametrize("default", [None, False, True])
+    def test_the_mode_is_a_context_or_a_default(self, default):
+        module = self.make_module(default_recurrent_mode=default)
+        assert module.recurrent_mode is bool(default)
+        for mode, expected in ((True, True), (False, False), ("recurrent", True)):
+            with set_recurrent_mode(mode), set_recurrent_mode(mode):
+                assert module.recurrent_mode is expected
+        assert module.recurrent_mode is bool(default)
+        rollout = self.one_by_one(module, self.make_frames((3, 6)), self.some_state(module, (3,)))
+        data = rollout.select(*module.in_keys)
+        with set_recurrent_mode(bool(default)):
+            expected = module(data.clone())["features"]
+        assert torch.equal(module(data)["features"], expected)
 
     # --- TorchRL's machinery
     def test_its_primer_is_found_inside_a_sequence(self):
@@ -334,6 +338,42 @@ class BeliefModuleContract(BeliefFrames):
         assert (batches[1][self.age_key][:, 0] > 0).any()  # a row that starts in mid-episode
         for batch in batches:
             self.check_collected(module, batch)
+
+    def test_slices_of_a_replay_buffer_replay_the_beliefs_that_were_collected(self):
+        module = self.make_module(dtype=torch.float64)
+        frames = self.make_frames((4, 9), torch.float64)
+        frames["is_init"][:, [0, 6]] = True
+        rollout = self.one_by_one(module, frames, None)
+        ends = torch.zeros(4, 9, 1, dtype=torch.bool)
+        ends[:, [5, 8]] = True
+        rollout["next", "done"] = ends
+        sampler = SliceSampler(slice_len=3, end_key=("next", "done"), strict_length=True)
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(36), sampler=sampler, batch_size=36
+        )
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            buffer.extend(rollout.reshape(-1))
+            sample = buffer.sample()
+        sample["is_init"][::3] = True  # as TorchRL marks slices for recurrent modules
+        assert (sample[self.age_key][::3] > 0).any()
+        self.assert_same(
+            module, self.as_sequence(module, sample.reshape(3, 12)).reshape(-1), sample
+        )
+
+    def test_its_entries_are_made_contiguous_beside_a_gru_s_and_no_other(self):
+        module = self.make_module()
+        gru = GRUModule(input_size=OBS, hidden_size=3, in_key="observation", out_key="gru")
+        data = self.make_frames((2, 5)).set("other", torch.zeros(5, 2).mT)
+        data["observation"] = torch.zeros(OBS, 5, 2).permute(2, 1, 0)
+        out = canonicalize_rnn_subset(data, [gru, module])
+        own = module.canonicalize(data)
+        assert out["observation"].is_contiguous()
+        assert own["observation"].is_contiguous()
+        assert own["other"].data_ptr() == data["other"].data_ptr()
+        assert not data["observation"].is_contiguous()
+        assert module.canonicalize(data, inplace=True) is data
+        assert data["observation"].is_contiguous()
 
     @pytest.mark.parametrize("kind", ["serial", "parallel", "gymnasium"])
     def test_it_runs_in_batched_environments(self, kind):
@@ -393,35 +433,105 @@ class BeliefModuleContract(BeliefFrames):
         for one, other in zip(exported.module()(**kwargs), expected, strict=True):
             torch.testing.assert_close(one, other)
 
+    # --- bad input
+    @pytest.mark.parametrize(
+        ("kwargs", "message"),
+        [
+            ({"in_keys": ["observation"]}, "`in_keys` must have 4 or"),
+            ({"in_keys": {"obs": "a"}}, "`in_keys` names"),
+            ({"in_keys": {"is_init": None}}, r"must name \['is_init'\]"),
+            ({"in_keys": ["x", "x", "a", "i"]}, "`in_keys` must give .* of its own: x twice"),
+            ({"in_key": "x", "in_keys": {}}, "`in_key` and `in_keys` were both given"),
+            ({"out_key": "x", "out_keys": []}, "`out_key` and `out_keys` were both given"),
+            ({"out_keys": {"feature": "a"}}, "`out_keys` names"),
+            ({"out_keys": {"features": "x", ("belief", "log_likelihood"): "x"}}, "x twice"),
+            ({"out_keys": ["features", ("next", "rnn")]}, "`out_keys` names .*'rnn'.* in_keys"),
+        ],
+    )
+    def test_a_wrong_key_is_refused(self, kwargs, message):
+        with pytest.raises(ValueError, match=message):
+            self.make_module(**kwargs)
+
+    @pytest.mark.parametrize("name", ["in_keys", "out_keys"])
+    def test_one_string_is_no_list_of_keys_and_a_list_is_a_nested_key(self, name):
+        with pytest.raises(
+            TypeError, match=f"`{name}` must be a list of keys or a dict, got 'feat"
+        ):
+            self.make_module(**{name: "features"})
+        module = self.make_module(in_keys=["a", ["b", "c"], "d", "e"], out_keys=["features"])
+        assert module.in_keys[:4] == ["a", ("b", "c"), "d", "e"]
+
+    @pytest.mark.parametrize(
+        ("absent", "remedy"),
+        [
+            ("observation", "in_keys"),
+            ("observed", "ObservationMissingness"),
+            ("previous_action", "PreviousAction"),
+            ("is_init", "InitTracker"),
+        ],
+    )
+    def test_an_absent_entry_is_named_with_its_remedy(self, absent, remedy):
+        with pytest.raises(KeyError, match=f"`{absent}` is not in the tensordict.*{remedy}"):
+            self.make_module()(self.make_frames((3,)).exclude(absent))
+
+    def test_a_sequence_without_a_batch_dimension_is_refused(self):
+        with set_recurrent_mode(True), pytest.raises(ValueError, match="no batch dimension"):
+            self.make_module()(self.make_frames(()))
+
+    @pytest.mark.parametrize("over_time", [False, True])
+    @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+    def test_what_is_no_number_under_a_true_mask_is_refused(self, over_time, wrong):
+        module = self.make_module()
+        data = self.one_by_one(module, self.make_frames((3, 4)), self.some_state(module, (3,)))
+        data["observed"][1, 2, 3], data["observation"][1, 2, 3] = True, wrong
+        with (
+            set_recurrent_mode(over_time),
+            pytest.raises(ValueError, match=r"`observation` holds .*components \[3\]"),
+        ):
+            module(data.select(*module.in_keys))
+
+    @pytest.mark.parametrize("over_time", [False, True])
+    def test_no_tensor_is_made_on_another_device(self, over_time):
+        # the device "meta" refuses to be mixed with "cpu", as a GPU does
+        module = self.make_module(out_keys=self.all_outputs)
+        data = self.one_by_one(module, self.make_frames((3, 4)), self.some_state(module, (3,)))
+        data, module = data.select(*module.in_keys).detach().to("meta"), module.to("meta")
+        module.filter.validate = False
+        with set_recurrent_mode(over_time):
+            out = module(data)
+        assert all(out[key].device.type == "meta" for key in module.out_keys)
+        self.differentiable(out).backward()
+        assert all(p.grad is None or p.grad.device.type == "meta" for p in module.parameters())
+
     # --- parameters
-    def test_the_state_survives_a_file(self):
-        first, second = self.make_module(), self.make_module()
+    def test_the_state_survives_a_file_and_a_copy_shares_nothing(self):
+        first, loaded = self.make_module(), self.make_module()
+        data = self.one_by_one(first, self.make_frames((3, 4)), self.some_state(first, (3,)))
         with torch.no_grad():
             for parameter in first.parameters():
                 parameter += 0.05
-        second.load_state_dict(saved(first.state_dict()))
-        frames = self.make_frames((3, 4))
-        with set_recurrent_mode(True):
-            expected, received = first(frames.clone()), second(frames.clone())
-        assert torch.equal(received["features"], expected["features"])
+        loaded.load_state_dict(saved(first.state_dict()))
+        copied = copy.deepcopy(first)
+        expected = self.as_sequence(first, data)["features"].clone()
+        with torch.no_grad():
+            for parameter in first.parameters():
+                parameter.zero_()
+        for other in (loaded, copied):
+            assert torch.equal(self.as_sequence(other, data)["features"], expected)
 
-    def test_a_deepcopy_computes_the_same_and_shares_nothing(self):
-        first = self.make_module()
-        second = copy.deepcopy(first)
-        frames = self.make_frames((3, 4))
-        with set_recurrent_mode(True):
-            expected = first(frames.clone())["features"].clone()
-            with torch.no_grad():
-                for parameter in first.parameters():
-                    parameter.zero_()
-            assert torch.equal(second(frames.clone())["features"], expected)
+    def test_reset_parameters_draws_them_anew(self):
+        module = self.make_module()
+        before = [parameter.detach().clone() for parameter in module.parameters()]
+        module.reset_parameters()
+        after = list(module.parameters())
+        assert any(not torch.equal(a, b) for a, b in zip(after, before, strict=True))
+        assert all(parameter.isfinite().all() for parameter in after)
 
     def test_every_parameter_gets_a_finite_gradient_over_time(self):
         module = self.make_module()
         frames = self.make_frames((3, 6))
         frames["is_init"][:, 0] = True
-        with set_recurrent_mode(True):
-            out = module(frames)
+        out = self.as_sequence(module, self.one_by_one(module, frames, None))
         self.differentiable(out).backward()
         for name, parameter in module.named_parameters():
             assert parameter.grad is not None, name
@@ -438,13 +548,14 @@ class BeliefModuleContract(BeliefFrames):
         outputs, grads = [], []
         for junk in (0.0, 7.0, float("nan"), float("inf")):
             module = self.make_module(dtype=torch.float64)
-            data = self.make_frames((3, 5), torch.float64)
+            data = self.one_by_one(module, self.make_frames((3, 5), torch.float64), None)
             data["observation"] = torch.where(data["observed"], data["observation"], junk)
-            with set_recurrent_mode(True):
-                out = module(data)
+            out = self.as_sequence(module, data.detach())
             (out["features"].sum() + out["belief", "log_likelihood"].sum()).backward()
             outputs.append(torch.cat([out[key].flatten() for key in self.written(module)]).detach())
-            grads.append(torch.cat([p.grad.flatten() for p in module.parameters()]))
+            grads.append(
+                torch.cat([p.grad.flatten() for p in module.parameters() if p.grad is not None])
+            )
         for output, grad in zip(outputs[1:], grads[1:], strict=True):
             assert torch.equal(output, outputs[0])
             assert torch.equal(grad, grads[0])
@@ -453,12 +564,9 @@ class BeliefModuleContract(BeliefFrames):
     @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
     def test_it_moves_to_a_gpu(self):
         module = self.make_module()
-        frames = self.make_frames((3, 6))
-        frames["is_init"][:, 0] = True
-        with set_recurrent_mode(True):
-            expected = module(frames.clone())
-            module = module.to("cuda")
-            received = module(frames.to("cuda"))
+        data = self.one_by_one(module, self.make_frames((3, 6)), None).detach()
+        expected = self.as_sequence(module, data)
+        received = self.as_sequence(module.to("cuda"), data.to("cuda"))
         self.differentiable(received).backward()
         for key in self.written(module):
             assert received[key].device.type == "cuda"
