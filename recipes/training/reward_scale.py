@@ -1,0 +1,93 @@
+"""Rewards over the running deviation of the discounted return, once a rollout."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional.running_moments import (
+    RunningMoments,
+    masked_moments,
+    merge_moments,
+    spread,
+)
+
+
+class ReturnStatistics(NamedTuple):
+    """Hold what is remembered from one rollout to the next; ``_asdict()`` goes into a checkpoint.
+
+    Attributes:
+        n: discounted returns seen, shape ``(1,)``, float64.
+        mean: their mean, shape ``(1,)``, reward units.
+        var: their variance, shape ``(1,)``, squared reward units.
+        discounted: the discounted return of the episodes that go on, shape ``(environments, 1)``.
+    """
+
+    n: Tensor
+    mean: Tensor
+    var: Tensor
+    discounted: Tensor
+
+    @classmethod
+    def start(cls, environments: int) -> ReturnStatistics:
+        """Return those of a run that begins.
+
+        Args:
+            environments: rows of every rollout.
+
+        Returns:
+            Nothing seen.
+        """
+        zero = torch.zeros(1, dtype=torch.float64)
+        return cls(zero, zero, zero, torch.zeros(environments, 1))
+
+
+@torch.no_grad()
+def scale_reward(
+    reward: Tensor,
+    done: Tensor,
+    statistics: ReturnStatistics,
+    *,
+    gamma: float,
+    clip: float = 10.0,
+    eps: float = 1e-8,
+) -> tuple[Tensor, ReturnStatistics]:
+    r"""Divide the rewards of a rollout by the running deviation of the discounted return.
+
+    With R_t = gamma R_{t-1} + r_t, R = 0 at the start of an episode, and var the variance of every
+    R up to the end of this rollout: scaled = clip(r / sqrt(var + eps), -clip, clip). One scale for
+    the whole rollout. The mean is not subtracted: that would change which policy is best. Reward
+    scaling of [Engstrom et al. 2020, Implementation matters in deep policy gradients].
+
+    Args:
+        reward: shape ``(environments, time, 1)``.
+        done: bool of that shape, True where an episode ended.
+        statistics: those of the rollouts before.
+
+    Keyword Args:
+        gamma: discount of the return, the agent's own.
+        clip: largest magnitude of a scaled reward.
+        eps: added to the variance, squared reward units.
+
+    Returns:
+        The scaled rewards, and the statistics with this rollout in them.
+
+    Raises:
+        ValueError: a reward is NaN or infinite.
+    """
+    if not bool(reward.isfinite().all()):
+        raise ValueError(
+            "`reward` holds NaN or an infinity, which would scale every later reward; look at the "
+            "environment's reward."
+        )
+    discounted, returns = statistics.discounted.to(reward), []
+    for r, over in zip(reward.unbind(1), done.unbind(1), strict=True):
+        discounted = gamma * discounted + r
+        returns.append(discounted)
+        discounted = torch.where(over, 0.0, discounted)
+    before = RunningMoments(statistics.n, statistics.mean, statistics.var)
+    after = merge_moments(before, masked_moments(torch.cat(returns)))
+    scaled = (reward / spread(after, eps)).clamp(-clip, clip)
+    return scaled.to(reward.dtype), ReturnStatistics(*after, discounted)
