@@ -135,22 +135,33 @@ def test_steps_that_torchrl_marks_invalid_do_not_count():
 def test_every_entry_read_can_be_renamed():
     data = make_data()
     expected = BeliefModelLoss()(data)["loss_model"]
-    names = {
-        "log_likelihood": (("belief", "log_likelihood"), "ll"),
-        "observed": ("observed", ("agent", "mask")),
-        "next_log_likelihood": (("next", "belief", "log_likelihood"), ("next", "ll")),
-        "next_observed": (("next", "observed"), ("next", "agent", "mask")),
-        "done": (("next", "done"), ("next", "agent", "done")),
-        "final": ("final", "cut"),
-    }
-    loss = BeliefModelLoss()
-    for name, (old, new) in names.items():
+    for old, new in (
+        (("belief", "log_likelihood"), "ll"),
+        (("next", "belief", "log_likelihood"), ("next", "ll")),
+        ("observed", ("agent", "mask")),
+        (("next", "observed"), ("next", "agent", "mask")),
+        (("next", "done"), ("next", "agent", "done")),
+        ("final", "cut"),
+    ):
         data.rename_key_(old, new)
-        loss.set_keys(**{name: new})
+    loss = BeliefModelLoss()
+    loss.set_keys(
+        log_likelihood="ll", observed=("agent", "mask"), done=("agent", "done"), final="cut"
+    )
     assert torch.equal(loss(data)["loss_model"], expected)
-    other = BeliefModelLoss()
-    other.in_keys = loss.in_keys
-    assert torch.equal(other(data)["loss_model"], expected)
+
+
+def test_an_end_that_a_sampler_of_single_steps_wrote_is_not_believed():
+    data = make_data(torch.float64)
+    data["next", "terminated"] = torch.zeros(BATCH, TIME, 1, dtype=torch.bool)
+    data["next", "terminated"][0, 2] = True
+    place = torch.arange(BATCH * TIME).reshape(BATCH, TIME, 1)
+    by_rows = data.copy().set("index", place[:, :1].expand(BATCH, TIME, 1))
+    by_steps = data.copy().set("index", place)
+    loss = BeliefModelLoss()
+    done, final = data["next", "done"].squeeze(-1), data["final"].squeeze(-1)
+    assert torch.equal(loss.last_steps(by_rows), done | final)
+    assert torch.equal(loss.last_steps(by_steps), data["next", "terminated"].squeeze(-1) | final)
 
 
 # ---------------------------------------------------------------------------------------- bad input

@@ -24,7 +24,7 @@ from agents import (
     make_filter,
 )
 from contracts import LossContract
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import nn
 from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
@@ -97,6 +97,8 @@ class TestContract(LossContract):
 class TestContractWithoutAModel(LossContract):
     """A GRU in the filter's place."""
 
+    test_compiled_without_a_break_it_is_the_same = None  # TorchRL's GRU does not compile
+
     def make_loss(self, **kwargs):
         return make_gru_loss()[1]
 
@@ -137,6 +139,19 @@ def test_what_the_collector_wrote_of_the_belief_is_not_read():
     out = loss(stale)
     for key, value in expected.items():
         assert torch.equal(out[key], value), key
+
+
+@pytest.mark.slow
+def test_compiled_ahead_of_time_the_gradients_are_the_same():
+    agent, data = make_belief_agent(), make_data()
+    loss = make_loss(agent)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    totals = [
+        sum(v for k, v in out.items() if k.startswith("loss"))
+        for out in (loss(data), compiled(data))
+    ]
+    for one, other in zip(*(gradients(agent, total) for total in totals), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
 
 
 # ------------------------------------------------------------------------- PPO as if it stood alone
@@ -399,33 +414,54 @@ def test_renamed_entries_reach_the_held_losses():
         ("sample_log_prob", "action_log_prob", "logp"),
         ("final", "final", "cut"),
         ("done", ("next", "done"), ("next", "over")),
+        ("terminated", ("next", "terminated"), ("next", "fell")),
     ):
         data.rename_key_(old, new)
         loss.set_keys(**{name: new})
     out = loss(data)
     for key, value in expected.items():
         assert torch.equal(out[key], value), key
-    assert loss.ppo_loss.tensor_keys.done == "over"
-    assert loss.model_loss.tensor_keys.done == ("next", "over")
-    loss.set_keys(done=None)
-    assert loss.ppo_loss.tensor_keys.done == "done"
-    assert loss.model_loss.tensor_keys.done == ("next", "done")
+    for part in (loss, loss.ppo_loss, loss.model_loss):
+        assert (part.tensor_keys.done, part.tensor_keys.terminated) == ("over", "fell")
+    loss.set_keys(done=None, terminated="terminated")
+    for part in (loss, loss.ppo_loss, loss.model_loss):
+        assert (part.tensor_keys.done, part.tensor_keys.terminated) == ("done", "terminated")
 
 
-def test_a_flag_named_as_torchrl_names_it_and_a_mask_of_another_name_lose_no_observation():
-    """TorchRL's losses look for `done` inside "next"; the next mask is called what the mask is."""
+def test_keys_set_on_a_held_loss_are_the_losss_own():
     agent, data = make_belief_agent(), make_data()
     expected = make_loss(agent)(data)
     loss = make_loss(agent)
-    loss.set_keys(done="done")
+    loss.ppo_loss.set_keys(advantage="adv", reward="scaled_reward")
+    loss.model_loss.set_keys(final="cut")
+    data.rename_key_("advantage", "adv").rename_key_("final", "cut")
+    assert (loss.tensor_keys.advantage, loss.tensor_keys.reward) == ("adv", "scaled_reward")
+    assert {"adv", "cut"} <= set(loss.in_keys)
     assert torch.equal(loss(data)["loss_model"], expected["loss_model"])
-    loss.set_keys(observed="mask")
-    for part in (loss, loss.model_loss):
-        assert part.tensor_keys.next_observed == ("next", "mask")
-    loss.set_keys(observed="mask", next_observed=("next", "other"))
-    assert loss.tensor_keys.next_observed == ("next", "other")
-    loss.set_keys(observed=None)
-    assert loss.tensor_keys.next_observed == ("next", "observed")
+
+
+def test_coefficients_are_those_of_the_held_loss():
+    agent, data = make_belief_agent(), make_data()
+    loss = make_loss(agent)
+    for name, value in (("entropy_coeff", 0.3), ("critic_coeff", 0.1), ("clip_epsilon", 0.05)):
+        setattr(loss, name, value)
+        for part in (loss, loss.ppo_loss):
+            assert getattr(part, name).item() == pytest.approx(value)
+    given = make_loss(agent, ppo={"entropy_coeff": 0.3, "critic_coeff": 0.1, "clip_epsilon": 0.05})
+    for key, value in given(data).items():
+        torch.testing.assert_close(loss(data)[key], value, msg=key)
+    loss.clip_epsilon = torch.tensor(0.2)
+    assert loss.ppo_loss.clip_epsilon == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("reduction", ["none", "sum", "mean"])
+def test_the_reduction_is_that_of_every_term(reduction):
+    agent, data = make_belief_agent(), make_data()
+    loss = make_loss(agent)
+    loss.reduction = reduction
+    assert loss.reduction == loss.ppo_loss.reduction == loss.model_loss.reduction == reduction
+    shape = data.shape if reduction == "none" else ()
+    assert all(v.shape == shape for k, v in loss(data).items() if k.startswith("loss"))
 
 
 def test_a_filter_with_keys_of_its_own_is_served():
@@ -444,13 +480,10 @@ def test_a_filter_with_keys_of_its_own_is_served():
         (("next", "is_init"), ("next", "first")),
     ):
         data.rename_key_(old, new)
-    loss = make_loss(agent, detach_belief=True)
-    loss.set_keys(
-        features="embed",
-        log_likelihood="ll",
-        observed=("agent", "mask"),
-        is_init="first",
-    )
+    model = BeliefModelLoss()
+    model.set_keys(log_likelihood="ll")
+    loss = make_loss(agent, model=model, detach_belief=True)
+    loss.set_keys(observed=("agent", "mask"), is_init="first")
     out = loss(data)
     for key, value in expected.items():
         assert torch.equal(out[key], value), key
@@ -541,11 +574,8 @@ def test_an_unknown_key_is_refused_with_those_it_accepts():
 
 def test_a_belief_module_without_a_likelihood_cannot_have_a_model_loss():
     agent, _ = make_gru_loss()
-    data = TensorDict.stack([make_data(torch.float32)])[0]
-    data["recurrent_state"] = torch.zeros(*data.shape, 1, 6)
-    loss = DRBPNLoss(agent.belief, make_ppo(agent), BeliefModelLoss())
-    with pytest.raises(KeyError, match="run the belief module on it"):
-        loss(data.exclude("belief", ("next", "belief")))
+    with pytest.raises(ValueError, match=r"`model_loss` reads .*not among the out_keys"):
+        DRBPNLoss(agent.belief, make_ppo(agent), BeliefModelLoss())
 
 
 @pytest.mark.parametrize(
@@ -566,7 +596,7 @@ def test_bad_data_are_refused_as_the_filter_refuses_them(key, value, message):
 def test_functional_or_not_gives_the_same_terms_and_gradients(model_coeff):
     agent, data = make_belief_agent(), make_data()
     outs = [
-        make_loss(agent, functional=functional, model_coeff=model_coeff)(data)
+        make_loss(agent, ppo={"functional": functional}, model_coeff=model_coeff)(data)
         for functional in (True, False)
     ]
     for key, value in outs[0].items():

@@ -105,7 +105,6 @@ class Agent(nn.Module):
             self.model_loss,
             model_coeff=settings.model_coeff,
             detach_belief=settings.detach_belief,
-            functional=False,
         )
 
     def value(self, tensordict: TensorDictBase) -> torch.Tensor:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives.common import LossModule
+from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS, LossModule
 
 __all__ = ["BeliefModelLoss"]
 
@@ -25,10 +25,12 @@ class BeliefModelLoss(LossModule):
     its scale does not change with the missing rate (``normalize="step"`` is the paper's).
 
     It holds no network: a belief module has written ``("belief", "log_likelihood")`` before.
-    Steps count with their own observation. Where an episode ends, or where the bool entry
-    ``final`` says that the rollout was cut, the next observation counts too if
-    ``("next", "belief", "log_likelihood")`` is there (:class:`DRBPNLoss` writes it): nobody
-    else's root step holds it.
+    Steps count with their own observation. The steps of :meth:`last_steps` count with the next one
+    too if ``("next", "belief", "log_likelihood")`` is there (:class:`DRBPNLoss` writes it): no
+    other step holds it.
+
+    Keys are named as in TorchRL's losses: the flags ``done`` and ``terminated`` are looked for
+    inside "next"; the next mask and the next likelihood are called what those of the step are.
 
     Keyword Args:
         normalize: "entry" divides by the number of observed entries, "step" by steps.
@@ -55,9 +57,8 @@ class BeliefModelLoss(LossModule):
 
         log_likelihood: NestedKey = ("belief", "log_likelihood")
         observed: NestedKey = "observed"
-        next_log_likelihood: NestedKey = ("next", "belief", "log_likelihood")
-        next_observed: NestedKey = ("next", "observed")
-        done: NestedKey = ("next", "done")
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
         final: NestedKey = "final"
 
     tensor_keys: _AcceptedKeys
@@ -81,21 +82,14 @@ class BeliefModelLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Entries read; the loss cannot do without the first two."""
-        return [getattr(self.tensor_keys, field.name) for field in fields(self._AcceptedKeys)]
+        keys = self.tensor_keys
+        nexts = (keys.log_likelihood, keys.observed, keys.done, keys.terminated)
+        return [keys.log_likelihood, keys.observed, *map(in_next, nexts), keys.final, "index"]
 
     @in_keys.setter
     def in_keys(self, value: list[NestedKey]) -> None:
-        names = [field.name for field in fields(self._AcceptedKeys)]
-        self.set_keys(**dict(zip(names, value, strict=False)))
-
-    def set_keys(self, **kwargs: Any) -> None:
-        """Rename entries.
-
-        Args:
-            kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default. See
-                :func:`following_keys` for what renaming one means for its next one.
-        """
-        super().set_keys(**following_keys(kwargs))
+        del value
+        raise RuntimeError("the in_keys follow from the keys: use set_keys to rename one.")
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Do nothing: this loss estimates no value."""
@@ -120,23 +114,21 @@ class BeliefModelLoss(LossModule):
                 f"{tuple(ll.shape)}, that of the log-likelihood, got {observed.dtype} "
                 f"{tuple(observed.shape)}."
             )
-        steps = torch.ones_like(ll)
-        entries = observed.sum(-1).to(ll.dtype)
-        next_ll = tensordict.get(keys.next_log_likelihood, None)
+        steps, entries = torch.ones_like(ll), observed.sum(-1).to(ll.dtype)
+        next_ll = tensordict.get(in_next(keys.log_likelihood), None)
         if next_ll is not None:
-            last = last_steps(tensordict, done=keys.done, final=keys.final, like=ll)
-            ll = ll + torch.where(last, next_ll, 0.0)
-            next_observed = tensordict.get(keys.next_observed, None)
+            next_observed = tensordict.get(in_next(keys.observed), None)
             if next_observed is None:
                 raise KeyError(
-                    f"`{keys.next_observed}` is not in the tensordict although "
-                    f"`{keys.next_log_likelihood}` is: the mask says how many entries it counts."
+                    f"`{in_next(keys.observed)}` is not in the tensordict although "
+                    f"`{in_next(keys.log_likelihood)}` is: the mask says how many entries it "
+                    "counts."
                 )
-            next_entries = next_observed.sum(-1)
-            entries = entries + torch.where(last, next_entries, 0)
+            last = self.last_steps(tensordict)
+            ll = ll + torch.where(last, next_ll, 0.0)
+            entries = entries + torch.where(last, next_observed.sum(-1), 0)
             steps = steps + last
-        valid = self._valid(tensordict, ll)
-        if valid is not None:
+        for valid in self._valid(tensordict, ll.shape):
             ll, entries, steps = (torch.where(valid, v, 0.0) for v in (ll, entries, steps))
 
         per_entry = ll.sum() / entries.sum().clamp_min(1.0)
@@ -148,64 +140,53 @@ class BeliefModelLoss(LossModule):
             value = -per_entry
         else:
             value = -ll.sum() / steps.sum().clamp_min(1.0)
-        return TensorDict(
-            {"loss_model": value, "log_likelihood": per_entry.detach()},
-            batch_size=ll.shape if self.reduction == "none" and per_entry.ndim else [],
+        return TensorDict({"loss_model": value, "log_likelihood": per_entry.detach()})
+
+    def last_steps(self, tensordict: TensorDictBase) -> Tensor:
+        """Tell the steps whose next observation is no other step's own.
+
+        Those that terminated, those that are ``final`` (the recipe cut its rollout there), and
+        those that are ``done``. A replay buffer of single steps is not believed that last one:
+        TorchRL's SliceSampler writes ``done`` where it cuts a slice, and the next observation is
+        another step's own there. Where it draws, mark the ends of episodes and rollouts as
+        ``final`` before they are stored.
+
+        Args:
+            tensordict: rollout data, batch size ``(*batch, time)``.
+
+        Returns:
+            Bool, shape ``(*batch, time)``.
+        """
+        keys, shape = self.tensor_keys, tensordict.shape
+        terminated, done, final = (
+            tensordict.get(key, None)
+            for key in (in_next(keys.terminated), in_next(keys.done), keys.final)
         )
+        device = tensordict.get(keys.observed).device
+        last = torch.zeros(shape, dtype=torch.bool, device=device)
+        for flag in (terminated, final):
+            if flag is not None:
+                last = last | flag.reshape(shape)
+        if done is not None:
+            index = tensordict.get("index", None)
+            done = done.reshape(shape)
+            if index is not None and shape:
+                # Where each step was stored. Of rows that were stored whole it is constant in time.
+                index = index.reshape(*shape, -1)
+                moves = index[..., 1:, :] != index[..., :-1, :]
+                done = done & ~moves.any(-1).any(-1, keepdim=True)
+            last = last | done
+        return last
 
-    def _valid(self, tensordict: TensorDictBase, like: Tensor) -> Tensor | None:
-        """Read the masks that TorchRL marks padded or cut steps with, as its own losses do."""
-        valid = None
-        for key in self._loss_mask_keys():
-            mask = tensordict.get(key, None)
-            if mask is not None:
-                mask = mask.reshape(like.shape)
-                valid = mask if valid is None else valid & mask
-        return valid
-
-
-def following_keys(names: dict[str, Any]) -> dict[str, Any]:
-    """Complete what the keys of an observation are called by what those of the next one are.
-
-    A flag ``done`` lies inside "next", where TorchRL's losses look for it: the root's tells what
-    happened before. The next mask and the next likelihood are called what the root's are.
-
-    Args:
-        names: accepted names and keys; None restores a default.
-
-    Returns:
-        The same, completed.
-    """
-    out = dict(names)
-    done = unravel_key(out["done"]) if out.get("done") is not None else None
-    if done is not None and not (isinstance(done, tuple) and done[0] == "next"):
-        out["done"] = unravel_key(("next", done))
-    for name in ("observed", "log_likelihood"):
-        if name in out and f"next_{name}" not in out:
-            key = out[name]
-            out[f"next_{name}"] = None if key is None else unravel_key(("next", key))
-    return out
+    def _valid(self, tensordict: TensorDictBase, shape: torch.Size) -> list[Tensor]:
+        """Return the masks that TorchRL marks padded or cut steps with, as its own losses do."""
+        key = self.loss_mask_key
+        keys = () if key is None else AUTO_LOSS_MASK_KEYS if key == "auto" else (key,)
+        masks = (tensordict.get(name, None) for name in keys)
+        return [mask.reshape(shape) for mask in masks if mask is not None]
 
 
-def last_steps(
-    tensordict: TensorDictBase, *, done: NestedKey, final: NestedKey, like: Tensor
-) -> Tensor:
-    """Tell the steps whose next observation no other root step holds.
-
-    Args:
-        tensordict: rollout data.
-
-    Keyword Args:
-        done: key of the bool entry that ends an episode, shape ``(*batch, 1)``.
-        final: key of the bool entry that marks where the rollout was cut; may be absent.
-        like: a tensor of the shape wanted, ``(*batch,)``.
-
-    Returns:
-        Bool, shape ``(*batch,)``.
-    """
-    last = torch.zeros_like(like, dtype=torch.bool)
-    for key in (done, final):
-        flag = tensordict.get(key, None)
-        if flag is not None:
-            last = last | flag.reshape(like.shape)
-    return last
+def in_next(key: NestedKey) -> NestedKey:
+    """Return a key inside "next", where it may be already."""
+    key = unravel_key(key)
+    return key if isinstance(key, tuple) and key[0] == "next" else unravel_key(("next", key))

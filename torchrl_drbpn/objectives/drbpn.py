@@ -4,23 +4,41 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.common import LossModule
-from torchrl.objectives.utils import ValueEstimators
+from torchrl.objectives.utils import (
+    ValueEstimators,
+    default_value_kwargs,
+    dispatch_value_estimator,
+)
 
-from torchrl_drbpn.modules import BeliefFilter, BeliefFilterModule
-from torchrl_drbpn.objectives._clipped import plain_heads, plain_terms
-from torchrl_drbpn.objectives._filtered import filtered_terms
-from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, following_keys, last_steps
+from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, in_next
 
 __all__ = ["DRBPNLoss"]
+
+
+def _held(name: str) -> Any:
+    """Pass a coefficient on to the held PPO loss, as a number or a tensor, in place."""
+
+    def read(self: DRBPNLoss) -> Any:
+        return getattr(self.ppo_loss, name)
+
+    def write(self: DRBPNLoss, value: Any) -> None:
+        buffer = read(self)
+        if isinstance(buffer, Tensor):
+            buffer.copy_(torch.as_tensor(value))
+        else:
+            setattr(self.ppo_loss, name, value)
+
+    return property(read, write, doc=f"``{name}`` of the held PPO loss.")
 
 
 class DRBPNLoss(LossModule):
@@ -34,23 +52,25 @@ class DRBPNLoss(LossModule):
     ``loss_critic`` does by its coefficient, so the sum of all ``loss_*`` is the total.
 
     The input is a batch of sequences, ``[*batch, time]``, cut from rollouts, with the stored
-    recurrent state: each sequence starts from the belief the collector stored there. Where an
-    episode ends, or ``final`` says that the rollout was cut, the next observation's likelihood
-    is added by one more step of the belief module.
+    recurrent state: each sequence starts from the belief the collector stored there. Where no other
+    step holds the next observation (:meth:`BeliefModelLoss.last_steps`), its likelihood is added by
+    one more step of the belief module.
+
+    Keys and coefficients are those of the held losses, set here or there. ``actor_network`` and
+    ``critic_network`` are whole: the belief module, then the head.
 
     Args:
         filter_module: a belief module, such as :class:`~torchrl_drbpn.BeliefFilterModule`.
-        ppo_loss: TorchRL's ClipPPOLoss over heads.
+        ppo_loss: TorchRL's ClipPPOLoss over heads. The belief module is functionalised if it is.
         model_loss: the model loss, None for belief modules without a likelihood.
 
     Keyword Args:
         model_coeff: lambda_m, at least 0; ``loss.model_coeff = 0.3`` changes it in place.
         detach_belief: keep PPO's gradient out of the filter.
-        functional: whether the belief module is functionalised, as in ClipPPOLoss; False spares
-            the swapping of its parameters at every call.
 
     Raises:
-        ValueError: for a negative coefficient.
+        ValueError: for a negative coefficient, and for a model loss over a belief module that
+            writes no likelihood.
         KeyError: if advantages are not in the tensordict.
 
     Example:
@@ -72,29 +92,25 @@ class DRBPNLoss(LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """Name the entries read; those of the held losses are passed on to them."""
+    class _AcceptedKeys(ClipPPOLoss.default_keys, BeliefModelLoss._AcceptedKeys):
+        """Name the entries read: those of the held losses, and what starts an episode."""
 
-        advantage: NestedKey = "advantage"
-        value_target: NestedKey = "value_target"
-        value: NestedKey = "state_value"
-        sample_log_prob: NestedKey = "action_log_prob"
-        action: NestedKey = "action"
-        features: NestedKey = "features"
-        log_likelihood: NestedKey = ("belief", "log_likelihood")
-        observed: NestedKey = "observed"
-        next_log_likelihood: NestedKey = ("next", "belief", "log_likelihood")
-        next_observed: NestedKey = ("next", "observed")
-        done: NestedKey = ("next", "done")
-        final: NestedKey = "final"
         is_init: NestedKey = "is_init"
 
-    tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.GAE
     filter_network: TensorDictModuleBase
     filter_network_params: TensorDictParams | None
     target_filter_network_params: TensorDictParams
     _schedulable_buffers = frozenset({"model_coeff"})
+
+    entropy_coeff = _held("entropy_coeff")
+    critic_coeff = _held("critic_coeff")
+    clip_epsilon = _held("clip_epsilon")
+    clip_epsilon_low = _held("clip_epsilon_low")
+    clip_epsilon_high = _held("clip_epsilon_high")
+    clip_value = _held("clip_value")
+    max_importance_ratio = _held("max_importance_ratio")
 
     def __init__(
         self,
@@ -104,13 +120,20 @@ class DRBPNLoss(LossModule):
         *,
         model_coeff: float = 1.0,
         detach_belief: bool = False,
-        functional: bool = True,
     ) -> None:
         super().__init__()
+        self._own_keys: DRBPNLoss._AcceptedKeys = super().tensor_keys
         if model_coeff < 0:
             raise ValueError(f"`model_coeff` must be at least 0, got {model_coeff}.")
-        self._functional = functional
-        if functional:
+        if model_loss is not None:
+            key = unravel_key(model_loss.tensor_keys.log_likelihood)
+            if key not in [unravel_key(out) for out in filter_module.out_keys]:
+                raise ValueError(
+                    f"`model_loss` reads {key!r}, which is not among the out_keys "
+                    f"{filter_module.out_keys} of `filter_module`. Add it there, rename it by "
+                    "model_loss.set_keys(log_likelihood=...), or pass model_loss=None."
+                )
+        if ppo_loss.functional:
             self.convert_to_functional(filter_module, "filter_network")
         else:
             self.filter_network = filter_module
@@ -121,58 +144,60 @@ class DRBPNLoss(LossModule):
         self.register_coeff_buffer("model_coeff", model_coeff)
 
     # ------------------------------------------------------------------ keys
+    @property
+    def tensor_keys(self) -> _AcceptedKeys:
+        """The entries read; those of a held loss are what they are called there."""
+        keys = self._own_keys
+        for part in (self.model_loss, self.ppo_loss):
+            for name, key in vars(part.tensor_keys).items() if part is not None else ():
+                setattr(keys, name, key)
+        return keys
+
     def set_keys(self, **kwargs: Any) -> None:
         """Rename entries, here and in the held losses.
 
         Args:
-            kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default. A
-                ``done`` is looked for inside "next", with or without that word; a next mask is
-                called what the mask is unless it is named too.
+            kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default. The
+                reward and the flags are looked for inside "next", with or without that word.
 
         Raises:
             ValueError: for an unknown name.
         """
-        mine = {f.name for f in fields(self._AcceptedKeys)}
-        unknown = sorted(set(kwargs) - mine)
+        mine = sorted(field.name for field in fields(self._AcceptedKeys))
+        unknown = sorted(set(kwargs) - set(mine))
         if unknown:
-            raise ValueError(f"{unknown} are no keys of DRBPNLoss; it accepts {sorted(mine)}.")
-        kwargs = following_keys(kwargs)
-        super().set_keys(**kwargs)
+            raise ValueError(f"{unknown} are no keys of DRBPNLoss; it accepts {mine}.")
+        for name in ("reward", "done", "terminated"):
+            if kwargs.get(name) is not None:
+                kwargs[name] = _without_next(kwargs[name])
         for part in (self.ppo_loss, self.model_loss):
             if part is not None:
-                accepted = {f.name for f in fields(part.default_keys)}
-                its = {name: key for name, key in kwargs.items() if name in accepted}
-                if part is self.ppo_loss and "done" in its:
-                    # PPO names the entry inside "next", the model loss from the root.
-                    its["done"] = _inside_next(its["done"])
-                part.set_keys(**its)
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        """Do nothing: the held PPO loss owns the value estimator."""
+                accepted = {field.name for field in fields(part.default_keys)}
+                part.set_keys(**{name: kwargs[name] for name in kwargs if name in accepted})
+        super().set_keys(**kwargs)
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Entries read: the belief module's, its next step's, the heads' own, those of PPO."""
-        keys = self.tensor_keys
-        belief = list(self.filter_network.in_keys)
-        following = [unravel_key(("next", key)) for key in belief]
-        written = {unravel_key(key) for key in self.filter_network.out_keys}
+        # Of the held losses: `dispatch` asks for the in_keys while it is compiled.
+        keys, belief = self.ppo_loss.tensor_keys, list(self.filter_network.in_keys)
         actor, critic = self.ppo_loss.actor_network, self.ppo_loss.critic_network
-        # A head may read more than features, as a critic that sees what the actor does not.
-        heads = [key for head in (actor, critic) if head is not None for key in head.in_keys]
-        made = written | {unravel_key(key) for key in actor.out_keys}
+        heads = [*actor.in_keys, *([] if critic is None else critic.in_keys)]
+        written = {unravel_key(key) for key in (*self.filter_network.out_keys, *actor.out_keys)}
+        model: list[NestedKey] = []
+        if self.model_loss is not None:
+            made = in_next(self.model_loss.tensor_keys.log_likelihood)
+            model = [key for key in self.model_loss.in_keys if key != made]
+        own = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target)
         read = [
             *belief,
-            *(key for key in following if key not in written),
-            *(key for key in map(unravel_key, heads) if key not in made),
-            keys.done,
-            keys.final,
-            keys.action,
-            keys.sample_log_prob,
-            keys.advantage,
-            keys.value_target,
+            *(in_next(key) for key in belief),
+            # A head may read more than features, as a critic that sees what the actor does not.
+            *heads,
+            *model,
         ]
-        return list(dict.fromkeys(read))
+        read = [key for key in map(unravel_key, read) if key not in written]
+        return list(dict.fromkeys([*read, *map(unravel_key, own)]))
 
     @in_keys.setter
     def in_keys(self, value: list[NestedKey]) -> None:
@@ -190,136 +215,139 @@ class DRBPNLoss(LossModule):
         del value
         raise RuntimeError("the out_keys follow from the held losses.")
 
+    # -------------------------------------------------------------- networks
+    @property
+    def reduction(self) -> str:
+        """How the terms of each step are reduced: "mean", "sum" or "none"."""
+        return str(self.ppo_loss.reduction)
+
+    @reduction.setter
+    def reduction(self, value: Literal["none", "mean", "sum"]) -> None:
+        self.ppo_loss.reduction = value
+        if self.model_loss is not None:
+            self.model_loss.reduction = value
+
+    @property
+    def actor_network(self) -> TensorDictSequential:
+        """The policy: the belief module, then the actor."""
+        return TensorDictSequential(self.filter_network, self.ppo_loss.actor_network)
+
+    @property
+    def critic_network(self) -> TensorDictSequential:
+        """The belief module, then the critic, over whole sequences as an estimator calls it."""
+        return _OverSequences(self.filter_network, self.ppo_loss.critic_network)
+
+    @property
+    def actor_network_params(self) -> TensorDictParams | None:
+        """Parameters of ``actor_network``; None if the held PPO loss isn't functional."""
+        return self._params(self.actor_network)
+
+    @property
+    def critic_network_params(self) -> TensorDictParams | None:
+        """Parameters of ``critic_network``; None if the held PPO loss isn't functional."""
+        return self._params(self.critic_network)
+
+    def _params(self, network: TensorDictModuleBase) -> TensorDictParams | None:
+        return TensorDict.from_module(network, as_module=True) if self.functional else None
+
+    @property
+    def functional(self) -> bool:
+        """Whether the parameters are swapped in at every call, as in the held PPO loss."""
+        return bool(self.ppo_loss.functional)
+
     def make_value_estimator(
         self, value_type: ValueEstimators | None = None, **hyperparams: Any
-    ) -> None:
-        """Pass on to the PPO loss.
+    ) -> DRBPNLoss:
+        """Build the estimator of advantages, over ``critic_network``.
 
         Args:
-            value_type: as in TorchRL's losses.
+            value_type: as in TorchRL's losses; GAE by default.
             hyperparams: of the estimator.
+
+        Returns:
+            The loss.
         """
-        self.ppo_loss.make_value_estimator(value_type, **hyperparams)
+        value_type = self.default_value_estimator if value_type is None else value_type
+        if not isinstance(value_type, ValueEstimators):
+            super().make_value_estimator(value_type, **hyperparams)
+            return self
+        names = ("advantage", "value_target", "value", "reward", "done", "terminated")
+        keys = {name: getattr(self.tensor_keys, name) for name in (*names, "sample_log_prob")}
+        dispatch_value_estimator(
+            self, value_type, supported=ClipPPOLoss.SUPPORTED_VALUE_ESTIMATORS, tensor_keys=keys,
+            **{**default_value_kwargs(value_type), "deactivate_vmap": True, **hyperparams},
+        )  # fmt: skip
+        return self
 
     def reset_parameters_recursive(self) -> None:
         """Put every parameter back to where a new module starts, the held losses' too."""
         super().reset_parameters_recursive()
         self.ppo_loss.reset_parameters_recursive()
 
-    # ------------------------------------------------------------------ forward
+    # --------------------------------------------------------------- forward
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the PPO terms, ``loss_model`` (weighted), and the metrics of both."""
-        keys = self.tensor_keys
-        if tensordict.get(keys.advantage, None) is None:
+        advantage = self.ppo_loss.tensor_keys.advantage
+        if tensordict.get(advantage, None) is None:
             raise KeyError(
-                f"`{keys.advantage}` is not in the tensordict: compute advantages over the whole "
+                f"`{advantage}` is not in the tensordict: compute advantages over the whole "
                 "rollout first (TorchRL's GAE), then cut it into minibatches."
             )
-        plain = self._plain_forward(tensordict)
-        if plain is not None:
-            return plain
-        data = tensordict.copy()
-        params = self.filter_network_params
+        data, params, model = tensordict.clone(False), self.filter_network_params, None
         with (
             nullcontext()
             if params is None
             else params.to_module(self.filter_network, preserve_module_state=False)
         ):
-            belief = getattr(self.filter_network, "filter", None)
-            # One set of Q, R, H, ... and one gradient of it for both passes.
-            with (
-                belief.shared_state_space()
-                if isinstance(belief, BeliefFilter) and self.model_loss is not None
-                else nullcontext()
-            ):
-                self.filter_network(data)
-                if self.model_loss is not None:
-                    self._add_last_observations(data)
-
-        model = None if self.model_loss is None else self.model_loss(data)
+            self.filter_network(data)
+            if self.model_loss is not None:
+                self._add_last_observations(data, self.model_loss)
+                model = self.model_loss(data)
         if self.detach_belief:
-            data.set(keys.features, data.get(keys.features).detach())
-        heads = plain_heads(self.ppo_loss, data)
-        out = (
-            self.ppo_loss(data)
-            if heads is None
-            else TensorDict(plain_terms(self.ppo_loss, heads, data, {}))
-        )
+            data.update(data.select(*self.filter_network.out_keys, strict=False).detach())
+        out: TensorDictBase = self.ppo_loss(data)
         if model is not None:
-            for name, value in model.items():
-                out.set(name, self.model_coeff * value if name == "loss_model" else value)
+            model.set("loss_model", self.model_coeff * model.get("loss_model"))
+            out.update(model)
         return out
 
-    def _plain_forward(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Do the same without TensorDicts in between, where everything is of the usual kind."""
-        features = self.tensor_keys.features
-        heads = plain_heads(self.ppo_loss, tensordict)
-        if heads is None or self.filter_network_params is not None:
-            return None
-        filtered = filtered_terms(self.filter_network, self.model_loss, tensordict)
-        if filtered is None or features not in filtered[0]:
-            return None
-        written, model = filtered
-        if self.detach_belief:
-            written = {**written, features: written[features].detach()}
-        terms = plain_terms(self.ppo_loss, heads, tensordict, written)
-        for name, value in model.items():
-            terms[name] = self.model_coeff * value if name == "loss_model" else value
-        return TensorDict(terms)
+    def _add_last_observations(self, data: TensorDictBase, model_loss: BeliefModelLoss) -> None:
+        """Write the likelihood of the next observation where no other step holds it.
 
-    def _add_last_observations(self, data: TensorDictBase) -> None:
-        """Write the likelihood of the next observation where no root step holds it.
-
-        Only those few steps are gathered: a masked pass over all of them would factorise twice as
-        many matrices as the filter itself.
+        Only those few steps are gathered: a pass over all of them would factorise twice as many
+        matrices as the filter itself. Their number depends on the data, so that a compiled loss
+        without breaks passes over all of them.
         """
-        keys = self.tensor_keys
-        log_likelihood = data.get(keys.log_likelihood, None)
-        if log_likelihood is None or data.get(keys.next_observed, None) is None:
-            return  # the model loss says what is missing; without a next step nothing is added
-        where = last_steps(data, done=keys.done, final=keys.final, like=log_likelihood).nonzero(
-            as_tuple=True
-        )
-        if not where[0].numel():
-            return  # no row ends here; not every belief module takes an empty batch
-        following = [data.get(("next", key), None) for key in self.filter_network.in_keys]
-        next_ll = self._next_log_likelihood([None if x is None else x[where] for x in following])
-        data.set(
-            keys.next_log_likelihood, torch.zeros_like(log_likelihood).index_put(where, next_ll)
-        )
-
-    def _next_log_likelihood(self, following: list[Tensor | None]) -> Tensor:
-        """Run the belief module on gathered steps, as sequences of one: they have the fast forms.
-
-        Args:
-            following: the entries that the belief module reads, ``(steps, ...)``.
-
-        Returns:
-            Shape ``(steps,)``.
-        """
-        module = self.filter_network
-        of_key = {
-            key: value.unsqueeze(1)
-            for key, value in zip(module.in_keys, following, strict=True)
-            if value is not None
-        }
-        count = len(next(iter(of_key.values())))
-        # A belief that goes on is what is wanted here.
-        goes_on = torch.zeros(count, 1, dtype=torch.bool, device=self.model_coeff.device)
-        if type(module) is BeliefFilterModule and len(of_key) == len(module.in_keys):
-            observation, observed, action, _, mean, _ = (of_key[key] for key in module.in_keys)
-            action = action.to(mean.dtype)
-            out = module.filter(mean[:, 0], None, action, observation, observed, goes_on)
-            return out.log_likelihood.squeeze(1)
-        gathered = TensorDict(of_key, batch_size=[count, 1])
-        gathered.set(self.tensor_keys.is_init, goes_on.unsqueeze(-1))
-        module(gathered)
-        return gathered.get(self.tensor_keys.log_likelihood).squeeze(1)
+        keys, following = model_loss.tensor_keys, data.get("next", None)
+        if following is None or following.get(keys.observed, None) is None:
+            return  # without a next step nothing is added
+        last = model_loss.last_steps(data).flatten()
+        if torch.compiler.is_compiling():
+            index = torch.arange(len(last), device=last.device)
+        else:
+            index = last.nonzero().squeeze(-1)
+        if not len(index):
+            return  # not every belief module takes an empty batch
+        belief_keys = self.filter_network.in_keys
+        # As sequences of one step, of a belief that goes on.
+        steps = following.select(*belief_keys, strict=False).reshape(-1)[index].unsqueeze(1)
+        goes_on = torch.zeros(*steps.shape, 1, dtype=torch.bool, device=last.device)
+        steps.set(self._own_keys.is_init, goes_on)
+        self.filter_network(steps)
+        found = steps.get(keys.log_likelihood).squeeze(1)
+        everywhere = found.new_zeros(len(last)).index_put((index,), found)
+        data.set(in_next(keys.log_likelihood), everywhere.reshape(data.shape))
 
 
-def _inside_next(key: NestedKey | None) -> NestedKey | None:
-    """Return ``("next", key)`` as PPO names it, without "next"."""
-    if isinstance(key, tuple) and key[0] == "next":
-        return unravel_key(key[1:])
-    return key
+class _OverSequences(TensorDictSequential):
+    """Modules over whole sequences, however their recurrent mode is set elsewhere."""
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        with set_recurrent_mode(True):
+            return super().forward(*args, **kwargs)
+
+
+def _without_next(key: NestedKey) -> NestedKey:
+    key = unravel_key(key)
+    return unravel_key(key[1:]) if isinstance(key, tuple) and key[0] == "next" else key
