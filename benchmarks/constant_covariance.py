@@ -27,7 +27,8 @@ from torchrl_drbpn.functional import (
     filter_sequence,
     full_cov,
     innovation,
-    normalised_squared,
+    nees,
+    nis,
     outage_rates,
     predict,
     sample_working,
@@ -155,18 +156,18 @@ def judge(
             )
         seen = observed[:, t]
         given = (observation[:, t], seen, model.emission_matrix, R, zero.expand(rows, -1))
-        sums["nis"] += normalised_squared(*innovation(belief, *given), seen)
+        sums["nis"] += nis(*innovation(belief, *given), seen)
         sums["dof"] += seen.sum(-1)
         belief = update(belief, *given)
         error = state[:, t] - belief.mean
         sums["se"] += error.square().sum(-1)
-        sums["nees"] += normalised_squared(error, belief.cov)
+        sums["nees"] += nees(error, belief.cov)
         gap = torch.bucketize(since + 1, edges, right=True)
         kind = torch.where(seen, 0, torch.where(ever, gap, never))
         ever, since = ever | seen, torch.where(seen, 0, since + 1)
         for index in kind.unique().tolist():
             chosen = kind == index
-            sums["nees by class"][:, index] += normalised_squared(error, belief.cov, chosen)
+            sums["nees by class"][:, index] += nis(error, belief.cov, chosen)
             sums["components by class"][:, index] += chosen.sum(-1)
     return sums | {"entries": torch.full((rows,), float(STATE * time), dtype=torch.float64)}
 

@@ -1,9 +1,8 @@
-"""Calibration: consistency tests, coverage, reliability, proper scores.
+"""Calibration: normalised squares and the test of consistency.
 
-Every statistic is held to a truth that does not use it: the exact Kalman filter on a known linear
-system (NIS and NEES have the mean that theory says, whatever is missing), quantiles with closed
-forms, numerical integration of the CRPS's definition, Gaussians whose deviation is known, and
-deleted entries. A filter with a wrong covariance is told from a right one.
+Held to a truth that does not use them: the exact Kalman filter on a known linear system (NIS and
+NEES have the mean that theory says, whatever is missing), quantiles with closed forms, deleted
+entries. A filter with a wrong covariance is told from a right one.
 """
 
 from __future__ import annotations
@@ -19,17 +18,12 @@ from torch import Tensor
 
 from torchrl_drbpn.functional import (
     Belief,
-    central_coverage,
     chi_square_quantile,
     consistency,
-    gaussian_crps,
-    gaussian_log_score,
-    gaussian_pit,
     innovation,
-    log_score,
-    normalised_squared,
+    nees,
+    nis,
     predict,
-    reliability_curve,
     update,
 )
 
@@ -38,7 +32,6 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 import constant_covariance
 
 BATCH, TIME, STATE, OBS = 256, 40, 3, 4
-LEVELS = torch.tensor([0.5, 0.9, 0.95], dtype=torch.float64)
 
 
 def randn(*shape: int, seed: int = 0) -> Tensor:
@@ -61,7 +54,7 @@ class Filtered:
         belief = Belief(
             system.initial_mean.expand(BATCH, -1), system.initial_cov.expand(BATCH, -1, -1)
         )
-        nis, nees, dof, errors, covs, masks = [], [], [], [], [], []
+        self.nis, self.nees, self.dof = (torch.empty(TIME, BATCH).double() for _ in range(3))
         for t in range(TIME):
             if t:
                 state = system.transition(state, action) + normal(system.transition_cov)
@@ -79,16 +72,10 @@ class Filtered:
             x = torch.where(seen, x, torch.nan)
             given = (x, seen, system.matrix, system.noise, system.bias.expand(BATCH, -1))
             error, cov = innovation(belief, *given)
-            nis.append(normalised_squared(error, claimed * cov, seen))
-            errors.append(error)
-            covs.append(claimed * cov)
-            masks.append(seen)
-            dof.append(seen.sum(-1))
+            self.nis[t] = nis(error, claimed * cov, seen)
+            self.dof[t] = seen.sum(-1)
             belief = update(belief, *given)
-            nees.append(normalised_squared(state - belief.mean, claimed * belief.cov))
-        self.nis, self.nees, self.dof = torch.stack(nis), torch.stack(nees), torch.stack(dof)
-        self.errors, self.covs = torch.stack(errors), torch.stack(covs)
-        self.observed = torch.stack(masks)
+            self.nees[t] = nees(state - belief.mean, claimed * belief.cov)
 
 
 @pytest.fixture(scope="module")
@@ -132,11 +119,6 @@ def test_the_consistency_test_passes_the_exact_filter_and_fails_wrong_covariance
     assert consistency(too_modest.nis, too_modest.dof, 0.999).ratio < lower
 
 
-def test_the_log_score_is_best_for_the_right_covariance(exact: Filtered) -> None:
-    scores = [log_score(exact.errors, c * exact.covs, exact.observed) for c in (0.7, 1.0, 1.4)]
-    assert min(scores) == scores[1]
-
-
 def test_a_constant_covariance_is_too_sure_in_outages_which_its_average_nis_does_not_tell() -> None:
     """The figures of docs/calibration.md, on fewer and shorter sequences."""
     model = constant_covariance.system()
@@ -177,34 +159,22 @@ def test_masking_an_entry_equals_deleting_its_row(seed: int) -> None:
     rows = seen.nonzero().squeeze(-1)
     small, e = cov[rows][:, rows], error[rows]
     hidden = torch.where(seen, error, torch.nan)
-    torch.testing.assert_close(
-        normalised_squared(hidden, cov, seen), e @ torch.linalg.solve(small, e)
-    )
-    density = torch.distributions.MultivariateNormal(torch.zeros_like(e), small).log_prob(e)
-    torch.testing.assert_close(log_score(hidden, cov, seen), -density / len(e))
-
-
-def test_missing_entries_count_in_neither_coverage_nor_reliability() -> None:
-    pit = torch.rand(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    seen = torch.rand(50, 4, generator=torch.Generator().manual_seed(1)) < 0.6
-    hidden = torch.where(seen, pit, torch.nan)
-    for curve in (central_coverage, reliability_curve):
-        torch.testing.assert_close(curve(hidden, LEVELS, seen), curve(pit[seen], LEVELS))
-        by_column = torch.stack([curve(pit[:, i][seen[:, i]], LEVELS) for i in range(4)])
-        torch.testing.assert_close(curve(hidden, LEVELS, seen, dim=0), by_column)
-        torch.testing.assert_close(curve(hidden.mT, LEVELS, seen.mT, dim=-1), by_column)
+    torch.testing.assert_close(nis(hidden, cov, seen), e @ torch.linalg.solve(small, e))
+    torch.testing.assert_close(nees(e, small), e @ torch.linalg.solve(small, e))
 
 
 def test_nothing_observed_is_zero_per_step_and_nan_as_an_average() -> None:
     nothing = torch.zeros(2, 3, dtype=torch.bool)
-    squared = normalised_squared(torch.full((2, 3), torch.nan), torch.eye(3), nothing)
+    squared = nis(torch.full((2, 3), torch.nan), torch.eye(3), nothing)
     assert (squared == 0).all()
     assert all(value.isnan() for value in consistency(squared, nothing.sum(-1)))
-    assert central_coverage(torch.full((2, 3), 0.5), LEVELS, nothing).isnan().all()
+    half = consistency(torch.ones(2, 3), torch.tensor([[0, 1, 1], [0, 1, 2]]), dim=0)
+    assert half.ratio.isnan().tolist() == [True, False, False]
 
 
-def test_steps_with_nothing_observed_change_no_consistency_test() -> None:
-    squared, dof = torch.tensor([2.0, 0.0, 5.0]), torch.tensor([2, 0, 3])
+@pytest.mark.parametrize("junk", [0.0, torch.nan, torch.inf])
+def test_steps_with_nothing_observed_change_no_consistency_test(junk: float) -> None:
+    squared, dof = torch.tensor([2.0, junk, 5.0]), torch.tensor([2, 0, 3])
     with_empty, without = consistency(squared, dof), consistency(squared[::2], dof[::2])
     assert all(a == b for a, b in zip(with_empty, without, strict=True))
     assert with_empty.ratio == 7 / 5
@@ -234,96 +204,8 @@ def test_a_zero_probability_has_the_quantile_zero_and_shapes_broadcast() -> None
     assert chi_square_quantile(torch.tensor([[0.1], [0.9]]), torch.arange(1, 4)).shape == (2, 3)
 
 
-# Coverage, reliability ---------------------------------------------------------------------------
-
-
-def test_intervals_of_the_right_gaussians_hold_what_they_claim() -> None:
-    mean, std = randn(20_000, seed=1), randn(20_000, seed=2).abs() + 0.1
-    value = mean + std * randn(20_000, seed=3)
-    pit = gaussian_pit(value, mean, std)
-    error = torch.sqrt(LEVELS * (1 - LEVELS) / 20_000)
-    assert ((central_coverage(pit, LEVELS) - LEVELS).abs() < 3.5 * error).all()
-    assert ((reliability_curve(pit, LEVELS) - LEVELS).abs() < 3.5 * error).all()
-
-
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_coverage_of_a_wrong_deviation_is_that_of_the_intervals_it_draws(factor: float) -> None:
-    value = randn(20_000, seed=4)
-    pit = gaussian_pit(value, torch.zeros(1), torch.tensor(factor))
-    # The interval of level p has half width factor z_p; the value is standard normal.
-    half = factor * torch.special.ndtri((1 + LEVELS) / 2)
-    expected = 2 * torch.special.ndtr(half) - 1
-    assert (central_coverage(pit, LEVELS) - expected).abs().max() < 0.012
-
-
-def test_central_intervals_end_at_the_same_distance_from_both_ends() -> None:
-    low, high = torch.tensor(0.1, dtype=torch.float64), torch.tensor(0.9, dtype=torch.float64)
-    levels = torch.tensor([0.799, 0.801], dtype=torch.float64)
-    for pit in (low, high):
-        assert central_coverage(pit, levels).tolist() == [0.0, 1.0]
-
-
-def test_a_biased_forecast_puts_the_reliability_curve_on_one_side() -> None:
-    pit = gaussian_pit(randn(5_000) + 0.5, torch.zeros(1), torch.ones(1))
-    levels = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)
-    assert (reliability_curve(pit, levels) < levels).all()
-
-
-# Scores ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("std", [0.2, 1.0, 3.0])
-@pytest.mark.parametrize("value", [-2.5, 0.3, 4.0])
-def test_the_crps_equals_the_integral_of_its_definition(value: float, std: float) -> None:
-    mean = 0.5
-    # The integrand jumps at the value: each side by itself, trapezoids on both.
-    total = 0.0
-    for low, high, step in ((mean - 12 * std - 10, value, 0.0), (value, mean + 12 * std + 10, 1.0)):
-        y = torch.linspace(low, high, 400_001, dtype=torch.float64)
-        gap = torch.special.ndtr((y - mean) / std) - step
-        total += torch.trapezoid(gap.square(), y).item()
-    crps = gaussian_crps(*(torch.tensor(v, dtype=torch.float64) for v in (value, mean, std)))
-    assert crps.item() == pytest.approx(total, rel=1e-7)
-
-
-def test_the_crps_without_a_spread_is_the_absolute_error() -> None:
-    value, mean = randn(10, seed=1), randn(10, seed=2)
-    zero = torch.zeros(10, dtype=torch.float64)
-    torch.testing.assert_close(gaussian_crps(value, mean, zero), (value - mean).abs())
-    assert (gaussian_crps(value, value, zero) == 0).all()
-
-
-def test_both_scores_are_proper_no_other_deviation_or_mean_scores_better() -> None:
-    value = randn(50_000, seed=7)
-    for score in (gaussian_crps, gaussian_log_score):
-
-        def mean_score(mean: float, std: float, score=score) -> float:
-            return score(value, torch.tensor(mean), torch.tensor(std)).mean().item()
-
-        best = mean_score(0.0, 1.0)
-        others = [(0.0, 0.7), (0.0, 1.4), (0.3, 1.0), (-0.3, 1.0)]
-        assert all(mean_score(*other) > best for other in others)
-
-
-def test_the_log_score_of_an_entry_is_minus_its_log_density() -> None:
-    value, mean, std = randn(9, seed=1), randn(9, seed=2), randn(9, seed=3).abs() + 0.1
-    expected = -torch.distributions.Normal(mean, std).log_prob(value)
-    torch.testing.assert_close(gaussian_log_score(value, mean, std), expected)
-    seen = torch.ones(1, 9, dtype=torch.bool)
-    joint = log_score((value - mean).unsqueeze(0), torch.diag(std.square()), seen)
-    torch.testing.assert_close(joint, expected.mean())
-
-
-def test_float32_is_kept_and_gradients_flow() -> None:
-    std = torch.ones(3, requires_grad=True)
-    crps = gaussian_crps(torch.zeros(3), torch.ones(3), std)
-    assert crps.dtype == torch.float32
-    (gradient,) = torch.autograd.grad(crps.sum(), std)
-    assert gradient.isfinite().all()
-
-
 @pytest.mark.parametrize(("obs", "state", "spread"), [(17, 4, 3.0), (27, 8, 1.0), (105, 16, 1.0)])
-def test_a_float32_belief_at_the_noise_floor_has_the_scores_of_float64(
+def test_a_float32_belief_at_the_noise_floor_has_the_nis_of_float64(
     obs: int, state: int, spread: float
 ) -> None:
     """H of low rank, R std .01: in float32 the innovation covariance has no Cholesky factor."""
@@ -336,15 +218,14 @@ def test_a_float32_belief_at_the_noise_floor_has_the_scores_of_float64(
     scores = []
     for m, P, reading, H, R in ([v.float() for v in doubles], doubles):
         error, S = innovation(Belief(m, P.expand(20, -1, -1)), reading, seen, H, R)
-        scores.append((normalised_squared(error, S, seen), log_score(error, S, seen)))
+        scores.append(nis(error, S, seen))
     torch.testing.assert_close(scores[0], scores[1], rtol=1e-9, atol=1e-9)
-    # What comes in float32 is scored in float64 too: the same as of the rounded numbers.
+    # What comes in float32 is computed in float64 too: the same as of the rounded numbers.
     error, S = 3 * randn(20, obs, seed=5), spd(obs, torch.Generator().manual_seed(6))
     rounded = error.float(), S.float(), seen
     widened = error.float().double(), S.float().double(), seen
-    for score in (normalised_squared, log_score):
-        assert torch.equal(score(*rounded), score(*widened))
-    assert 0.8 < float(scores[1][0].sum() / seen.sum()) < 1.2
+    assert torch.equal(nis(*rounded), nis(*widened))
+    assert 0.8 < float(scores[1].sum() / seen.sum()) < 1.2
 
 
 # Bad input ---------------------------------------------------------------------------------------
@@ -353,11 +234,7 @@ def test_a_float32_belief_at_the_noise_floor_has_the_scores_of_float64(
 def test_bad_input_is_answered_with_its_name() -> None:
     numbers = torch.ones(2, 3)
     with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
-        normalised_squared(numbers, torch.eye(3), numbers)
-    with pytest.raises(ValueError, match="`observed` must be bool"):
-        central_coverage(numbers, LEVELS, torch.ones(2, dtype=torch.bool))
-    with pytest.raises(ValueError, match="`observed` must be bool"):
-        log_score(numbers, torch.eye(3), torch.ones(3, dtype=torch.bool))
+        nis(numbers, torch.eye(3), numbers)
     with pytest.raises(ValueError, match="`dof` must have the shape of `squared`"):
         consistency(numbers, torch.ones(3))
     with pytest.raises(ValueError, match=r"`probability` must lie in \(0, 1\), got 1.0"):

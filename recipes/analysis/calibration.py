@@ -32,14 +32,9 @@ from training.config import MissingnessSettings, NoiseSettings
 from training.envs import copy_statistics
 from training.errors import UserError
 
+from analysis.scores import gaussian_crps, gaussian_log_score, gaussian_pit
 from torchrl_drbpn import seed_env
-from torchrl_drbpn.functional import (
-    gaussian_crps,
-    gaussian_log_score,
-    gaussian_pit,
-    normalised_squared,
-    zero_missing,
-)
+from torchrl_drbpn.functional import nis, zero_missing
 
 COVERAGE = (0.5, 0.9, 0.95)
 LEVELS = tuple(round(0.05 * i, 2) for i in range(1, 20))  # of the reliability curve
@@ -309,13 +304,13 @@ def _add_forecast(
     part = _by_class(tally, numbers, mask, steps["class"])
     if forecast.target == READING:
         error, cov = value - mean, steps["predicted cov"]
-        part["nis_joint"] = normalised_squared(error, cov, mask).sum(-1, keepdim=True)
+        part["nis_joint"] = nis(error, cov, mask).sum(-1, keepdim=True)
         part["nis"] = torch.zeros_like(part["count"])
         present = torch.unique(steps["class"][mask])
         for index in present.tolist():
             # What arrived of one class is a Gaussian vector of its own: rows of the whole one.
             chosen = mask & (steps["class"] == index)
-            part["nis"][:, index] = normalised_squared(error, cov, chosen).sum(-1)
+            part["nis"][:, index] = nis(error, cov, chosen).sum(-1)
     _accumulate(sums, part)
     under = pit.unsqueeze(-1) <= torch.tensor(LEVELS, dtype=pit.dtype)
     counts = (under & mask.unsqueeze(-1)).sum((1, 2)).double()

@@ -2,15 +2,10 @@
 
 from torchrl_drbpn.functional.calibration import (
     Consistency,
-    central_coverage,
     chi_square_quantile,
     consistency,
-    gaussian_crps,
-    gaussian_log_score,
-    gaussian_pit,
-    log_score,
-    normalised_squared,
-    reliability_curve,
+    nees,
+    nis,
 )
 from torchrl_drbpn.functional.compiled import native_error
 from torchrl_drbpn.functional.corruption import (
@@ -62,7 +57,7 @@ from torchrl_drbpn.functional.particles import (
 )
 from torchrl_drbpn.functional.recurrence import MeanNetwork
 from torchrl_drbpn.functional.saturation import saturate_innovation
-from torchrl_drbpn.functional.selection import SensorSelection, select_sensors
+from torchrl_drbpn.functional.sensor_selection import SensorSelection, select_sensors
 
 __all__ = [
     "Belief",
@@ -81,7 +76,6 @@ __all__ = [
     "Prospect",
     "SensorSelection",
     "StateSpace",
-    "central_coverage",
     "chi_square_quantile",
     "choose_form",
     "consistency",
@@ -94,26 +88,22 @@ __all__ = [
     "filter_step",
     "filtered_cov",
     "full_cov",
-    "gaussian_crps",
-    "gaussian_log_score",
-    "gaussian_pit",
     "innovation",
     "inverse_softplus",
     "log_likelihood",
     "log_mean_weight",
-    "log_score",
     "masked_cov",
     "masked_log_density",
     "missing_probability",
     "native_error",
-    "normalised_squared",
+    "nees",
+    "nis",
     "outage_rates",
     "particle_sequence",
     "particle_step",
     "positive_std",
     "predict",
     "predict_step",
-    "reliability_curve",
     "resample",
     "sample_noise",
     "sample_observed",

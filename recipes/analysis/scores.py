@@ -1,0 +1,71 @@
+r"""Proper scores of Gaussian predictions, entry by entry: claiming another variance never pays.
+
+[Gneiting 2007] is Gneiting, Raftery, *Strictly Proper Scoring Rules, Prediction, and Estimation*,
+JASA 102.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+_LOG_2PI = math.log(2 * math.pi)
+
+
+def gaussian_pit(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    r"""Return the probability that was given to values under the one that came.
+
+    .. math:: u = \Phi\left( (x - \mu) / \sigma \right)
+
+    The probability integral transform: uniform on [0, 1] if the distributions are right.
+
+    Args:
+        value: x, any shape.
+        mean: broadcasts with ``value``.
+        std: broadcasts with ``value``, positive.
+
+    Returns:
+        The broadcast shape, in [0, 1].
+    """
+    return torch.special.ndtr((value - mean) / std)
+
+
+def gaussian_crps(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    r"""Score by the continuous ranked probability score, the integral of (F(y) - [x <= y])^2.
+
+    .. math:: \sigma \left( z (2 \Phi(z) - 1) + 2 \varphi(z) - \pi^{-1/2} \right)
+
+    Eq. (21) [Gneiting 2007], with the sign turned: smaller is better, 0 is perfect.
+
+    Args:
+        value: x, any shape.
+        mean: broadcasts with ``value``.
+        std: broadcasts with ``value``; 0 leaves the absolute error.
+
+    Returns:
+        The broadcast shape, units of ``value``.
+    """
+    error = value - mean
+    z = error / std.clamp_min(torch.finfo(std.dtype).tiny)
+    density = torch.exp(-0.5 * (z.square() + _LOG_2PI))
+    # error * (2 Phi - 1) rather than std * z * (...): std 0 leaves |error|.
+    spread = error * (2 * torch.special.ndtr(z) - 1)
+    return spread + std * (2 * density - 1 / math.sqrt(math.pi))
+
+
+def gaussian_log_score(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    r"""Score by minus the log-density of what came.
+
+    .. math:: \tfrac12 \left( z^2 + \log \sigma^2 + \log 2\pi \right)
+
+    Args:
+        value: x, any shape.
+        mean: broadcasts with ``value``.
+        std: broadcasts with ``value``, positive.
+
+    Returns:
+        The broadcast shape, nats; smaller is better.
+    """
+    return 0.5 * (((value - mean) / std).square() + _LOG_2PI) + std.log()

@@ -1,0 +1,247 @@
+r"""Choose sensors: the components whose readings leave the belief least uncertain.
+
+With x = H s + eps, s ~ N(m, P) and eps ~ N(0, R), reading the rows S leaves the covariance
+:math:`P^+_S`, whatever the readings are (eq. 10 [DRBPN]). So which sensors are worth having is
+known from H, P and R alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Integral
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["SensorSelection", "select_sensors"]
+
+Criterion = Literal["D", "A"]
+
+# Gains closer than this are a tie, nats for D, a share of tr C P C' for A: far above rounding.
+_TIE = 1e-10
+
+
+class SensorSelection(NamedTuple):
+    r"""Hold sensors in the order in which they were chosen, and what each choice left.
+
+    Args:
+        indices: rows of H, best first, int64, shape ``(*batch, count)``.
+        objective: of :math:`P^+` after ``always`` and the sensors up to this one: its
+            log-determinant for "D" (nats), the trace of :math:`C P^+ C'` for "A" (squared units
+            of the target); float64, shape ``(*batch, count)``.
+        information: what these readings say about the state beyond ``always``,
+            :math:`\tfrac12 (\log|P^+_{always}| - \log|P^+|)`, nats; float64, the same shape.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(3)
+        >>> chosen = select_sensors(eye, eye, torch.tensor([1.0, 0.1, 0.5]), 2)
+        >>> chosen.indices.tolist(), bool((chosen.information.diff() > 0).all())
+        ([1, 2], True)
+    """
+
+    indices: Tensor
+    objective: Tensor
+    information: Tensor
+
+
+@torch.no_grad()
+def select_sensors(
+    emission_matrix: Tensor,
+    predicted_cov: Tensor,
+    emission_cov: Tensor,
+    count: int,
+    *,
+    criterion: Criterion = "D",
+    always: Sequence[int] | Sequence[bool] | Tensor = (),
+    target: Tensor | None = None,
+) -> SensorSelection:
+    r"""Choose the sensors that reduce the belief's uncertainty most, one after the other.
+
+    .. math::
+        \text{D:}\; \min_S \log|P^+_S| \;\Leftrightarrow\; \max_S I(s; x_S)
+        = \tfrac12 \log|I + R_{SS}^{-1} H_S P H_S'|, \qquad
+        \text{A:}\; \min_S \mathrm{tr}\, C P^+_S C'
+
+    :math:`P^+_S` is the filtered covariance of eq. (10) [DRBPN] with the rows S observed. Greedy:
+    the first k of a longer selection are the selection of k; a pick costs one rank-one update.
+
+    - D, diagonal R: :math:`I(s; x_S)` is monotone and submodular, hence at least
+      :math:`1 - 1/e` of the best set of that size [Nemhauser, Wolsey, Fisher 1978; Krause,
+      Guestrin 2005; Shamaiah, Banerjee, Vikalo 2010].
+    - D with a full R (a sensor may read nothing but another one's noise) and A are monotone, not
+      submodular: no such bound [Bian, Buhmann, Krause, Tschiatschek 2017; Chamon, Pappas,
+      Ribeiro 2021].
+
+    D does not depend on the units or the basis of the state, A does: for a learned state
+    ``target=H`` adds up the variances of what the sensors would read without noise. Differences
+    under 1e-10 (nats for D, of tr C P C' for A) are ties, which go to the lowest index.
+
+    Args:
+        emission_matrix: H, shape ``(*batch, obs, state)``.
+        predicted_cov: P, the covariance before the readings, shape ``(*batch, state, state)``.
+        emission_cov: R, shape ``(*batch, obs, obs)``, or its diagonal ``(obs,)``.
+        count: how many to choose.
+
+    Keyword Args:
+        criterion: "D", the log-determinant, or "A", the trace.
+        always: sensors that are there anyway: indices, or bool of shape ``(obs,)``; they are read
+            first and not chosen.
+        target: C, what of the state is to be known, shape ``(*batch, target, state)``; "A" only.
+            None: the whole state, C = I.
+
+    Returns:
+        The :class:`SensorSelection`; computed in float64, no gradient.
+
+    Raises:
+        ValueError: for shapes that do not fit, covariances that are none, values that are not
+            finite, an unknown criterion, sensors that do not exist, or more than there are.
+
+    Example:
+        >>> import torch
+        >>> H = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        >>> P, R = torch.diag(torch.tensor([4.0, 1.0])), torch.tensor([0.5, 0.4, 0.5])
+        >>> select_sensors(H, P, R, 3).indices.tolist()  # the second view comes last
+        [1, 2, 0]
+
+    See also :func:`update`, whose covariance this is. For a trained
+    :class:`~torchrl_drbpn.BeliefFilter` P is ``filter.state_space().transition_cov``.
+    """
+    if criterion not in ("D", "A"):
+        raise ValueError(f"`criterion` must be 'D' (log det) or 'A' (trace), got {criterion!r}.")
+    if target is not None and criterion != "A":
+        raise ValueError("`target` weighs the trace: it needs criterion='A', got 'D'.")
+    H, P, R = _as_matrices(emission_matrix, predicted_cov, emission_cov)
+    obs, batch = H.shape[-2], H.shape[:-2]
+    C, there = _as_target(target, H), _as_indices(always, obs)
+    if (
+        isinstance(count, bool)
+        or not isinstance(count, Integral)
+        or not 0 <= count <= obs - len(there)
+    ):
+        raise ValueError(
+            f"`count` must be an int from 0 to {obs - len(there)}, the sensors that are not in "
+            f"`always`, got {count!r}."
+        )
+    # Given the readings so far: covariances of (x, C s) with x, and of the noise. Both matrices
+    # lose a multiple of the same row with every reading, so the first two are one.
+    joint, noise = torch.cat([H @ P @ H.mT + R, C @ P @ H.mT], -2), R
+    initial_trace = trace = (C @ P * C).sum((-2, -1))
+    information = torch.zeros_like(trace)
+    seen = torch.zeros(*batch, obs, dtype=torch.bool, device=H.device)
+    steps = []
+    for place in range(len(there) + int(count)):
+        # What was read has no variance left; 1 keeps the ratios defined. A reading varies at least
+        # as its noise does, but for rounding.
+        own = noise.diagonal(dim1=-2, dim2=-1).masked_fill(seen, 1.0)
+        variance = joint[..., :obs, :].diagonal(dim1=-2, dim2=-1).masked_fill(seen, 1.0)
+        variance = torch.maximum(variance, own)
+        told = 0.5 * (variance / own).log()  # I(s; x_i | readings)
+        lowered = joint[..., obs:, :].square().sum(-2) / variance  # by how much tr C P+ C' falls
+        if place < len(there):
+            index = torch.full((*batch, 1), there[place], device=H.device)
+        else:
+            gain = (told if criterion == "D" else lowered).masked_fill(seen, -torch.inf)
+            tie = _TIE if criterion == "D" else _TIE * initial_trace.unsqueeze(-1)
+            # The first True: mathematically equal gains differ by rounding.
+            best = gain >= gain.amax(-1, keepdim=True) - tie
+            index = best.to(torch.uint8).argmax(-1, keepdim=True)
+        information = information + told.gather(-1, index).squeeze(-1)
+        trace = trace - lowered.gather(-1, index).squeeze(-1)
+        seen = seen.scatter(-1, index, True)
+        joint, noise = _without(joint, index), _without(noise, index)
+        steps.append((index.squeeze(-1), trace, information))
+    before = steps[len(there) - 1][2] if there else torch.zeros_like(trace)
+    chosen = steps[len(there) :]
+    if not chosen:
+        nothing = H.new_zeros(*batch, 0)
+        return SensorSelection(nothing.long(), nothing, nothing)
+    indices, traces, told_so_far = (torch.stack(part, -1) for part in zip(*chosen, strict=True))
+    log_det = torch.linalg.slogdet(P).logabsdet.unsqueeze(-1)
+    objective = log_det - 2.0 * told_so_far if criterion == "D" else traces
+    return SensorSelection(indices, objective, told_so_far - before.unsqueeze(-1))
+
+
+def _without(cov: Tensor, index: Tensor) -> Tensor:
+    """Condition on one component: cov - cov[:, i] cov[i, :] / cov[i, i]."""
+    rows, columns = cov.shape[-2:]
+    row = cov.gather(-2, index.unsqueeze(-1).expand(*index.shape[:-1], 1, columns))
+    column = cov.gather(-1, index.unsqueeze(-2).expand(*index.shape[:-1], rows, 1))
+    pivot = row.gather(-1, index.unsqueeze(-1))
+    return cov - column * (row / pivot)
+
+
+def _as_matrices(H: Tensor, P: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return H, P and R as matrices in float64 with one batch shape, or say what is wrong."""
+    if H.ndim < 2 or 0 in H.shape[-2:] or not bool(H.isfinite().all()):
+        raise ValueError(
+            f"`emission_matrix` must be H, finite, of shape (*batch, obs, state), got "
+            f"{tuple(H.shape)}. Was it learned, and did it diverge?"
+        )
+    obs, state = H.shape[-2:]
+    R = R.diag() if R.ndim == 1 else R
+    for name, cov, size in (("predicted_cov", P, state), ("emission_cov", R, obs)):
+        if cov.shape[-2:] != (size, size):
+            raise ValueError(
+                f"`{name}` must be of shape (*batch, {size}, {size}) as `emission_matrix` "
+                f"{tuple(H.shape)} has it, got {tuple(cov.shape)}."
+            )
+        # A product such as J P J' in float32 is symmetric up to rounding only.
+        scale = cov.diagonal(dim1=-2, dim2=-1).abs().amax()
+        symmetric = bool((cov - cov.mT).abs().amax() <= 1e-5 * scale)
+        if not symmetric or bool(torch.linalg.cholesky_ex(cov.double()).info.any()):
+            raise ValueError(
+                f"`{name}` must be finite, symmetric and positive definite: a direction without "
+                "any variance has no log-determinant. Add a small variance to its diagonal."
+            )
+    try:
+        batch = torch.broadcast_shapes(H.shape[:-2], P.shape[:-2], R.shape[:-2])
+    except RuntimeError as error:
+        raise ValueError(
+            "`emission_matrix`, `predicted_cov` and `emission_cov` must have batch shapes that "
+            f"broadcast, got {tuple(H.shape[:-2])}, {tuple(P.shape[:-2])}, {tuple(R.shape[:-2])}."
+        ) from error
+    P, R = (0.5 * (cov + cov.mT) for cov in (P.double(), R.double()))
+    return (
+        H.double().expand(*batch, obs, state),
+        P.expand(*batch, state, state),
+        R.expand(*batch, obs, obs),
+    )
+
+
+def _as_target(C: Tensor | None, H: Tensor) -> Tensor:
+    """Return C in float64 and in H's batch shape; the identity where there is none."""
+    state, batch = H.shape[-1], H.shape[:-2]
+    C = torch.eye(state, dtype=H.dtype, device=H.device) if C is None else C.double()
+    given = (1,) * (len(batch) + 2 - C.ndim) + C.shape
+    fits = all(mine in (1, wanted) for mine, wanted in zip(given, batch, strict=False))
+    if (
+        C.ndim < 2
+        or len(given) > len(batch) + 2
+        or C.shape[-1] != state
+        or not fits
+        or not bool(C.isfinite().all())
+    ):
+        raise ValueError(
+            f"`target` must be finite and of shape (*batch, target, state) with state={state} and "
+            f"the batch shape {tuple(batch)} of the model or none, got {tuple(C.shape)}."
+        )
+    return C.expand(*batch, *C.shape[-2:])
+
+
+def _as_indices(always: Sequence[int] | Sequence[bool] | Tensor, obs: int) -> list[int]:
+    """Return the indices of the sensors that are there anyway, each once, in order."""
+    tensor = torch.as_tensor(always)
+    if tensor.numel() == 0 and tensor.dtype != torch.bool:
+        return []
+    flags = tensor.dtype == torch.bool
+    if tensor.ndim != 1 or tensor.is_floating_point() or (flags and len(tensor) != obs):
+        raise ValueError(
+            f"`always` must be a list of indices, or {obs} bools, True where a sensor is there "
+            f"anyway, got {always!r}."
+        )
+    indices = tensor.nonzero().flatten() if flags else tensor
+    if bool(((indices < -obs) | (indices >= obs)).any()):
+        raise ValueError(f"`always` must hold indices from {-obs} to {obs - 1}, got {always!r}.")
+    return sorted({int(i) % obs for i in indices})
