@@ -24,8 +24,7 @@ from analysis.calibration_figures import (
     reliability_figure,
 )
 from analysis.calibration_tables import calibration_rows, precision_rows, reliability_rows
-from analysis.report_page import csv_cells
-from analysis.report_runs import find_folders
+from analysis.runs import find_folders, write_table
 from evaluation.conditions import Point, check_reduction_seed, removed_sensors
 from evaluation.grid import parse_points
 from evaluation.trained import TrainedAgent, load_trained_agent, with_checkpoint
@@ -35,7 +34,6 @@ from training.config import check_mode, missingness_name
 from training.console import say, start
 from training.errors import UserError
 from training.methods import training_labels
-from training.run_folder import write_table
 
 from torchrl_drbpn import BeliefDivergedError
 
@@ -88,10 +86,10 @@ def run(config: dict[str, Any]) -> int:
     if not precision:
         raise UserError("no point is left: every belief diverged, see above. Name other `points`.")
     out.mkdir(parents=True, exist_ok=True)
-    write_table(out / "precision.csv", csv_cells(precision))
+    write_table(out / "precision.csv", precision)
     for name, rows in (("calibration.csv", calibration), ("reliability.csv", reliability)):
         if rows:
-            write_table(out / name, csv_cells(rows))
+            write_table(out / name, rows)
         else:
             (out / name).unlink(missing_ok=True)  # of an earlier diagnosis, no longer true
     pooled = _pooled(series)

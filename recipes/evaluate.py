@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from analysis.report_evaluations import GRID_TABLE, POINTS_TABLE
-from analysis.report_runs import find_folders
-from analysis.robustness_figure import draw_robustness, read_rows
+import pandas as pd
+from analysis.figures import draw_evaluation
+from analysis.runs import EPISODE_TABLES, find_folders
 from evaluation.conditions import Point, check_reduction_seed, identity
 from evaluation.grid import (
     Grid,
@@ -73,7 +73,7 @@ def run(config: dict[str, Any]) -> int:
     results.write()
     say(f"written: {output}")
     if config["figures"]:
-        for task, figure in draw_robustness(read_rows(results.rows)).items():
+        for task, figure in draw_evaluation(pd.read_csv(output)).items():
             path = output.with_name(f"{output.stem}-{task}.png")
             save_figure(figure, path, dpi=120)
             say(f"written: {path}")
@@ -128,12 +128,12 @@ def _protocol(config: dict[str, Any]) -> Protocol:
 
 
 def _output(config: dict[str, Any], folders: Sequence[Path]) -> Path:
-    name, gate = Path(GRID_TABLE if config["points"] is None else POINTS_TABLE), config["gate"]
+    name, gate = Path(EPISODE_TABLES[config["points"] is not None]), config["gate"]
     place = folders[0] if len(folders) == 1 else Path()
     if gate is not None:
         # Reports read the tables of these names as those of the agent as it was trained.
         name = name.with_name(f"{name.stem}-gate{gate:g}{name.suffix}")
-        if config["output"] and Path(config["output"]).name in (GRID_TABLE, POINTS_TABLE):
+        if config["output"] and Path(config["output"]).name in EPISODE_TABLES:
             raise UserError(
                 f"`output` must not be called {Path(config['output']).name} with a gate, as "
                 f"reports would read it as without: take {name} or another name."

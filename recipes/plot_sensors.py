@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import hydra
 import torch
-from analysis.report_runs import find_folders
+from analysis.runs import find_folders
 from analysis.sensor_figures import covariance_figure, ranking_figure
 from evaluation.sensor_choice import SensorModel, learned_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent, with_checkpoint

@@ -1,55 +1,34 @@
 """Report finished runs: ``python recipes/report.py 'run=runs/robust/*' out=results/robust``.
 
-Writes CSV files, figures, and README.md with the tables, the commands and the versions behind them.
-No seed is left out. ``notes.md`` in that folder, written by hand, is put below the heading.
-
-``python recipes/report.py out=results/robust`` makes the same again, byte for byte, from the run
-folders in ``results/robust/runs`` and the options of the last report, kept in report.yaml.
-``python recipes/report.py index=results`` does so for every study there and writes
-``results/README.md``.
+Writes what was measured (``runs.csv``, ``training.csv``, ``evaluation.csv``), and from these tables
+alone ``summary.csv``, ``aggregate.csv``, ``comparison.csv``, figures and ``README.md``;
+``python recipes/report.py from=results/robust`` makes the latter again, ``'from=results/*'`` of
+every study. ``notes.md`` in that folder, written by hand, is put below the heading.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
+import glob
 from pathlib import Path
 from typing import Any
 
 import hydra
-from analysis.report_figures import learning_curves, robustness
-from analysis.report_index import index_page, studies_of
-from analysis.report_options import OPTIONS_FILE, Options, read_options
-from analysis.report_page import Tables, csv_cells, study_page
-from analysis.report_paper import aggregate_rows, efficiency_rows, margin_rows
-from analysis.report_runs import find_folders, read_study, without_rollout
-from analysis.report_tables import evaluation_rows, summary_rows, training_rows
+import pandas as pd
+from analysis.figures import learning_curves, robustness
+from analysis.page import page
+from analysis.runs import Study, find_folders, read_runs, write_table
+from analysis.tables import aggregate, compare, summarise
 from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.console import say, start
 from training.errors import UserError
-from training.run_folder import write_table, write_whole
+from training.run_folder import write_whole
 
 NOTES_FILE = "notes.md"
-# In this order: the page, which names the others, comes last.
-_FILES = (
-    OPTIONS_FILE,
-    "training.csv",
-    "evaluation.csv",
-    "summary.csv",
-    "aggregate.csv",
-    "margins.csv",
-    "efficiency.csv",
-    "learning_curves.png",
-    "robustness.png",
-    "robustness_mean_actions.png",
-    "README.md",
-)
 
 
 def run(config: dict[str, Any]) -> int:
-    """Read the runs and write the study, or every study of an index.
+    """Write a study from its runs, or the pages of studies from their tables.
 
     Args:
         config: see conf/report.yaml.
@@ -57,95 +36,71 @@ def run(config: dict[str, Any]) -> int:
     Returns:
         The exit status.
     """
-    if config["index"] is not None:
+    if config["from"] is not None:
         if config["run"] is not None or config["out"] is not None:
-            raise UserError("`index` makes every study again: leave out `run` and `out`.")
-        return _write_index(Path(config["index"]))
-    if config["out"] is None:
-        raise UserError(
-            "`out` must be given: 'run=runs/*' out=results/<study>, or out=results/<study> alone "
-            "to make it again from results/<study>/runs."
-        )
-    out = Path(config["out"])
-    if out.exists() and not out.is_dir():
-        raise UserError(f"`out` must be a folder, {out} is a file.")
-    wanted = config["run"] if config["run"] is not None else str(out / "runs" / "*")
-    _write_study(wanted, out, read_options(config, out))
+            raise UserError(
+                "`from` reads and writes the tables of a study: leave out `run`, `out`."
+            )
+        for folder in _studies(config["from"]):
+            _write_page(folder, config)
+        return 0
+    out = config["out"] and Path(config["out"])
+    if not out or out.is_file():
+        raise UserError(f"`out` must be the folder of a study, such as results/robust, got {out}.")
+    if not isinstance(config["rows"], int) or config["rows"] < 2:
+        raise UserError(f"`rows` must be a whole number of at least 2, got {config['rows']!r}.")
+    study = read_runs(
+        find_folders(config["run"]), rows=config["rows"], unfinished=config["unfinished"]
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    study.write(out)
+    _write_page(out, config)
     return 0
 
 
-def _write_index(folder: Path) -> int:
-    studies = studies_of(folder)
-    for study in studies:
-        _write_study(str(study / "runs" / "*"), study, read_options({}, study))
-    write_whole(folder / "README.md", index_page(folder, studies))
-    say(f"{len(studies)} studies, written: {folder / 'README.md'}")
-    return 0
+def _studies(wanted: str | list[str]) -> list[Path]:
+    texts = [wanted] if isinstance(wanted, str) else wanted
+    found = sorted({Path(p) for text in texts for p in glob.glob(str(text))})
+    studies = [folder for folder in found if (folder / "runs.csv").is_file()]
+    if not studies:
+        raise UserError(f"`from` must name folders with a runs.csv, {wanted} matches none.")
+    return studies
 
 
-def _write_study(wanted: Any, out: Path, options: Options) -> None:
-    folders = find_folders(wanted)
-    waiting = without_rollout(folders) if options.unfinished else []
-    begun = [folder for folder in folders if folder not in waiting]
-    if not begun:
-        raise UserError(f"`run` must name runs with a finished rollout, {len(waiting)} have none.")
-    runs = read_study(begun, unfinished=options.unfinished)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    # Everything is made beside the study first: an error leaves the old one as it was.
-    work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    try:
-        summary = summary_rows(runs)
-        tables = Tables(
-            summary,
-            aggregate_rows(summary),
-            margin_rows(runs, summary),
-            efficiency_rows(runs),
-        )
-        for name, rows in {
-            "training.csv": [row for r in runs for row in training_rows(r, options.rows)],
-            "evaluation.csv": [row for r in runs for row in evaluation_rows(r)],
-            "summary.csv": tables.summary,
-            "aggregate.csv": tables.aggregate,
-            "margins.csv": tables.margins,
-            "efficiency.csv": tables.efficiency,
-        }.items():
-            if rows:
-                write_table(work / name, csv_cells(rows))
-        figures = {
-            "learning_curves.png": learning_curves(runs, options.rows),
-            "robustness.png": robustness(runs, "sampled"),
-            "robustness_mean_actions.png": robustness(runs, "mean"),
-        }
-        drawn = {name: figure for name, figure in figures.items() if figure is not None}
-        for name, figure in drawn.items():
-            save_figure(figure, work / name, dpi=110)
-        name = out.resolve().name
-        page = study_page(
-            runs,
-            tables,
-            list(drawn),
-            title=options.title or name,
-            notes=_notes(out),
-            name=name,
-            options=options.words(),
-            waiting=[folder.name for folder in waiting],
-        )
-        write_whole(work / "README.md", page)
-        write_whole(work / OPTIONS_FILE, options.text())
-        out.mkdir(exist_ok=True)
-        for name in _FILES:
-            if (work / name).is_file():
-                os.replace(work / name, out / name)
-            else:
-                (out / name).unlink(missing_ok=True)  # of an earlier report, no longer true
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-    say(f"{len(runs)} runs, written: {out}")
+def _write_page(folder: Path, config: dict[str, Any]) -> None:
+    """Write all that follows from the tables of a study."""
+    study = Study.read(folder)
+    summary = summarise(study)
+    tables = {
+        "summary": summary,
+        "aggregate": aggregate(study, summary),
+        "comparison": compare(study, summary, config["reference"]),
+    }
+    figures: dict[str, Any] = {"learning_curves.png": learning_curves(study.training)}
+    for mode, name in (("sampled", "robustness.png"), ("mean", "robustness_mean_actions.png")):
+        shown = summary[summary["mode"] == mode]
+        figures[name] = robustness(shown, rows="kind", columns="task")
+    for name, table in tables.items():
+        _replace(folder / f"{name}.csv", table if len(table) else None)
+    for name, figure in figures.items():
+        _replace(folder / name, figure)
+    drawn = [name for name, figure in figures.items() if figure is not None]
+    notes, path = folder / NOTES_FILE, folder / "README.md"
+    text = notes.read_text(encoding="utf-8") if notes.is_file() else ""
+    heading = path.read_text(encoding="utf-8").split("\n")[0][2:] if path.is_file() else folder.name
+    title = config["title"] or heading
+    write_whole(path, page(study, tables, drawn, title=title, notes=text, folder=folder.name))
+    say(f"{len(study.runs)} runs, written: {folder}")
 
 
-def _notes(out: Path) -> str:
-    path = out / NOTES_FILE
-    return path.read_text(encoding="utf-8") if path.is_file() else ""
+def _replace(path: Path, content: Any) -> None:
+    """Write a table or a figure; one of an earlier report that is not true any more is removed."""
+    if content is None:
+        path.unlink(missing_ok=True)
+    elif isinstance(content, pd.DataFrame):
+        write_table(path, content)
+    else:
+        save_figure(content, path, dpi=80, palette=True)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="report")

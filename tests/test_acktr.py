@@ -7,8 +7,6 @@ belief that has weights of its own is refused.
 
 from __future__ import annotations
 
-import dataclasses
-import shlex
 from pathlib import Path
 
 import pytest
@@ -20,8 +18,6 @@ from recipe_tools import differences, make_config, read_table  # isort: skip
 
 from algorithms import build_algorithm
 from algorithms.acktr import ACKTR
-from analysis.report_commands import training_command
-from analysis.report_runs import read_study
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.config import read_settings
 from training.errors import UserError
@@ -164,14 +160,3 @@ def test_bad_settings_are_refused_in_one_line(override: str, line: str) -> None:
     with pytest.raises(UserError, match=line) as error:
         build_algorithm(settings, make_agent(settings)[1])
     assert "\n" not in str(error.value)
-
-
-def test_the_report_tells_it_from_ppo_and_names_its_command(smoke: Path) -> None:
-    (study,) = read_study([smoke])
-    assert study.group["method"] == "none (acktr)"
-    command = training_command(study)
-    words = shlex.split(command)[2:]
-    assert "algo=acktr" in words
-    again = read_settings(make_config(*(word for word in words if "hydra" not in word)))
-    # How often a run is saved is no part of its result, and of its command neither.
-    assert dataclasses.replace(again, checkpoint=study.settings.checkpoint) == study.settings

@@ -32,7 +32,7 @@ from analysis.calibration_tables import (
     precision_rows,
     reliability_rows,
 )
-from analysis.report_page import csv_cells
+from analysis.runs import write_table
 from beliefs import ESTIMATE, FORECAST, FORECAST_COV
 from evaluation.episodes import make_evaluation_environment
 from evaluation.trained import TrainedAgent, load_trained_agent
@@ -43,7 +43,7 @@ from training.config import read_settings
 from training.envs import copy_statistics
 from training.errors import UserError
 from training.loop import assemble, train_rollout, training_state
-from training.run_folder import write_config, write_table
+from training.run_folder import write_config
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
 BINS = [1, 2, 3, 6]
@@ -414,7 +414,7 @@ def test_the_outage_figure_is_the_same_from_the_table(tmp_path: Path) -> None:
         for name, tally in kinds.items()
         for row in calibration_rows(tally, **options)
     ]
-    write_table(tmp_path / "calibration.csv", csv_cells(rows))
+    write_table(tmp_path / "calibration.csv", rows)
     series = [Series("Task-v5", "mcar:0.4", n, "none", 1, t) for n, t in kinds.items()]
     first = outage_figure(series, **options)
     second = draw_outages(read_outages(tmp_path / "calibration.csv"))
@@ -440,7 +440,7 @@ def test_runs_of_one_kind_in_a_table_are_pooled_by_their_entries(tmp_path: Path)
         {"run": "a", "missing_ratio": 0.2, **common, **row, "count": 300, "crps": 1.0},
         {"run": "b", "missing_ratio": 0.4, **common, **row, "count": 100, "crps": 5.0},
     ]
-    write_table(tmp_path / "calibration.csv", csv_cells(rows))
+    write_table(tmp_path / "calibration.csv", rows)
     (pooled,) = read_outages(tmp_path / "calibration.csv")
     assert (pooled.runs, pooled.missing_ratio) == (2, pytest.approx(0.3))
     (only,) = pooled.rows

@@ -25,7 +25,6 @@ from evaluation.conditions import parse_point
 from evaluation.grid import agent_of, evaluate_tasks
 from evaluation.trained import TrainedAgent, load_trained_agent
 from recipe_tools import make_config
-from report_tools import make_run, report
 from training.config import Settings, read_settings
 from training.console import run_or_explain
 from training.errors import UserError
@@ -182,20 +181,3 @@ def test_an_error_of_the_filter_is_one_line_of_every_command(
 
     assert run_or_explain(job) == 2
     assert capsys.readouterr().err == "error: the belief is no longer finite\n"
-
-
-def test_a_report_tells_in_how_many_episodes_a_belief_diverged(tmp_path: Path) -> None:
-    for seed in (0, 1):
-        folder = make_run(tmp_path / f"drbpn-s{seed}", seed=seed)
-        with (folder / "points.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        for row in rows:
-            hit = seed == 1 and row["mechanism"] == "mcar" and row["episode"] == "0"
-            row["diverged"] = str(int(hit))
-        write_table(folder / "points.csv", rows)
-    report(str(tmp_path / "drbpn-*"), tmp_path / "out")
-    page = (tmp_path / "out" / "README.md").read_text()
-    (line,) = [line for line in page.splitlines() if line.startswith("| mcar:0.5 |")]
-    assert line.endswith("85 % (diverged: 25 %) |")  # one of four
-    (clean,) = [x for x in page.splitlines() if x.startswith("| none:0 |") and "[" in x]
-    assert "diverged" not in clean

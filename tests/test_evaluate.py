@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 import shutil
 import sys
 from collections.abc import Iterator
@@ -27,7 +26,8 @@ from recipe_tools import ROOT, make_config  # isort: skip
 
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
-from analysis.robustness_figure import draw_robustness, mean_interval, read_rows
+import pandas as pd
+from analysis.figures import draw_evaluation
 from evaluation import grid as evaluation_grid
 from evaluation.conditions import Point, evaluate_points, parse_point, removed_sensors
 from evaluation.episodes import Episodes
@@ -36,6 +36,7 @@ from evaluation.sensor_choice import kept_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent
 from training.config import Settings, read_settings
 from training.errors import UserError
+from training.run_folder import read_config, write_config
 from training.sensor_groups import sensor_groups
 from training.sensors import named_tasks, sensor_names
 
@@ -327,9 +328,8 @@ def test_another_study_of_the_same_folder_names_is_not_taken_for_it(
         evaluate(out, second, points="none:0")
     shutil.rmtree(second)
     shutil.copytree(drbpn, second)
-    cell = {"study": "clean", "choices": {"method": "drbpn", "seed": "s0"}}
-    (second / "cell.json").write_text(json.dumps(cell))
-    with pytest.raises(UserError, match="with study none, and clean is asked for"):
+    write_config(second, read_config(second) | {"method": "ppo_ours"})
+    with pytest.raises(UserError, match="with method drbpn, and ppo_ours is asked for"):
         evaluate(out, second, points="none:0")
     assert out.read_bytes() == before
 
@@ -493,70 +493,11 @@ def test_groups_need_names() -> None:
 # Figures --------------------------------------------------------------------------------------
 
 
-def test_the_interval_of_a_mean_covers_it_95_times_in_100() -> None:
-    generator = np.random.default_rng(0)
-    hits = 0
-    for trial in range(1000):
-        mean, low, high = mean_interval([generator.normal(3.0, 2.0, 30).tolist()], seed=trial)
-        assert low < mean < high
-        hits += low < 3.0 < high
-    # The percentile bootstrap of n values is as wide as 1.96 sqrt((n - 1) / n) standard errors, and
-    # Student's t of 29 degrees exceeds 1.93 in 6.4 % of all cases.
-    assert abs(hits / 1000 - 0.936) < 3 * (0.936 * 0.064 / 1000) ** 0.5
-
-
-def test_the_interval_sees_the_spread_between_runs() -> None:
-    generator = np.random.default_rng(0)
-    same = generator.normal(0.0, 1.0, 30)
-    _, low, high = mean_interval([(same + shift).tolist() for shift in (-5.0, 0.0, 5.0)])
-    _, inner_low, inner_high = mean_interval([same.tolist()] * 3)
-    assert high - low > 5 * (inner_high - inner_low)
-
-
-def test_the_interval_sees_what_the_episodes_of_all_runs_have_in_common() -> None:
-    generator, hits = np.random.default_rng(1), {True: 0, False: 0}
-    for trial in range(300):
-        common = generator.normal(0.0, 1.0, 30)
-        runs = [(common + generator.normal(0.0, 0.3, 30)).tolist() for _ in range(3)]
-        for shared in hits:
-            _, low, high = mean_interval(runs, seed=trial, shared=shared)
-            hits[shared] += low < 0.0 < high
-    assert hits[True] / 300 > 0.9
-    assert hits[False] / 300 < 0.85  # as if there were three times as many choices
-
-
-def test_a_figure_draws_removed_sensors_in_common(drbpn: Path, tmp_path: Path) -> None:
-    """Runs whose n-th episodes have equal returns are worth no more than one of them."""
-    point = "'reduction:0.5:random',none:0"
-    rows = evaluate(tmp_path / "out.csv", drbpn, points=point, modes=["sampled"], episodes=20)
-    for i, row in enumerate(rows):
-        row["return"] = str(float(i % 7))
-
-    def width(table: list[dict[str, str]]) -> float:
-        (figure,) = draw_robustness(read_rows(table)).values()
-        (band,) = figure.axes[0].collections
-        ends = band.get_paths()[0].vertices
-        at = ends[ends[:, 0] == ends[:, 0].max()][:, 1]
-        return float(at.max() - at.min())
-
-    thrice = [row | {"run": f"run{i}"} for i in range(3) for row in rows]
-    assert width(thrice) == pytest.approx(width(rows), rel=0.15)
-
-
-def test_a_figure_has_a_panel_a_family_and_both_ratios(drbpn: Path, tmp_path: Path) -> None:
-    points = "none:0,'mcar:0.5','reduction:0.5:random','reduction:0.5:model','outages:0.5:2'"
-    out = tmp_path / "out.csv"
-    rows = evaluate(out, drbpn, points=points + ",'outages:0.5:9','noise:1'", figures=True)
+def test_a_figure_has_a_panel_a_family_and_kind_of_action(drbpn: Path, tmp_path: Path) -> None:
+    points = "none:0,'mcar:0.5','reduction:0.5:random','outages:0.5:2','outages:0.5:9','noise:1'"
+    evaluate(tmp_path / "out.csv", drbpn, points=points, figures=True)
     assert (tmp_path / "out-InvertedPendulum-v5.png").is_file()
-    (figure,) = draw_robustness(read_rows(rows)).values()
+    (figure,) = draw_evaluation(pd.read_csv(tmp_path / "out.csv")).values()
     titles = [axis.get_title(loc="left") for axis in figure.axes]
-    assert titles == ["MCAR", "sensor reduction", "outages, ratio 0.5"] * 2  # noise has one level
-    mcar = figure.axes[0]
-    assert mcar.get_xlabel() == "nominal missing ratio"
-    (above,) = mcar.child_axes
-    assert above.get_xlabel() == "realised missing ratio"
-    labels = [label.get_text() for label in above.get_xticklabels()]
-    realised = [row for row in rows if row["point"] == "mcar:0.5" and row["mode"] == "sampled"]
-    steps = sum(float(row["length"]) for row in realised)
-    missing = sum(float(row["length"]) * float(row["missing_ratio"]) for row in realised) / steps
-    assert labels == [".00", f"{missing:.2f}".removeprefix("0")]
+    kinds = ["MCAR", "outages 0.5 sensor", "reduction random"]  # noise has one level
+    assert titles == [f"{kind}, {mode}" for mode in ("mean", "sampled") for kind in kinds]

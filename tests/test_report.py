@@ -1,564 +1,417 @@
-"""The report of finished runs.
+"""Reports: what the tables say of a few small runs, and that tables alone give the page again.
 
-Every seed stands beside every mean and none is left out: a mean over fewer seeds than were run is
-not given. Interquartile means, intervals, margins and sample efficiency are what a few numbers give
-by hand. The same folders give the same bytes, also from a copy of what is committed, and the
-commands give back the configurations. A folder that can't be used, or runs that make no mean
-together, are answered with one line, and an earlier report is left as it was.
+Run folders have what a run leaves behind, with numbers that are easy to sum up. Statistics equal
+values by hand. Runs are averaged over seeds only; a mean that lacks a seed is not given. What a
+user gets wrong is one line.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import shlex
+import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from recipe_tools import ROOT, make_config  # isort: skip
-from report_tools import ASKED, VERSIONS, make_run, quantity, report, table  # isort: skip
+from recipe_tools import BELIEFS, ROOT, make_config  # isort: skip
 
-from analysis.report_commands import training_command
-from analysis.report_evaluations import point_kind, point_order
-from analysis.report_index import index_page, studies_of
-from analysis.report_paper import steps_to_threshold, top_return
-from analysis.report_runs import StudyRun, find_folders, flat, read_study
-from analysis.report_tables import format_number
+from analysis.figures import draw_evaluation, episode_summary
+from analysis.runs import missingness_point, over_episodes, read_runs, write_table
+from analysis.statistics import interquartile_mean, interval, probability_of_improvement, ratio
+from analysis.tables import point_kind, point_order
 from report import run
 from training.errors import UserError
-from training.run_folder import Table, write_table
+from training.methods import method_name, training_labels
+from training.run_folder import write_config
 
-COMMITTED = sorted(path.parent for path in (ROOT / "results").glob("*/runs"))
+ASKED = {"run": None, "out": None, "from": None, "title": None}
+ASKED |= {"reference": "drbpn", "rows": 100, "unfinished": False}
+FRAMES = [100, 200, 300, 400]
+STUDIES = sorted(path.parent for path in (ROOT / "results").glob("*/runs.csv"))
+WRITTEN = ("summary.csv", "aggregate.csv", "comparison.csv", "README.md")
+
+
+# Run folders ------------------------------------------------------------------------------------
+
+
+def episodes(returns: dict[str, tuple[float, ...]], mode: str = "sampled") -> list[dict[str, Any]]:
+    """Rows of recipes/evaluate.py: of two episodes of a point the second is three times as long."""
+    return [
+        {"frames": 400, "point": point, "mode": mode, "episode": i, "return": value}
+        | {"length": 10 + 20 * i, "missing_ratio": point_kind(point)[1], "diverged": 0}
+        for point, values in returns.items()
+        for i, value in enumerate(values)
+    ]
+
+
+def make_run(
+    folder: Path,
+    *overrides: str,
+    seed: int = 0,
+    final: float = 50.0,
+    frames: list[int] = FRAMES,
+    points: dict[str, tuple[float, ...]] | None = None,
+) -> Path:
+    """Write what a run leaves behind."""
+    folder.mkdir(parents=True)
+    usual = ("env=hopper", "env.version=v4", "total_frames=400", f"seed={seed}")
+    write_config(folder, make_config(*usual, *overrides))
+    (folder / "versions.json").write_text(json.dumps({"torch": "2.13.0", "git_commit": "abc"}))
+    last = {"episodes": 200, "return": final, "missing_ratio": 0.3, "log_likelihood": 1.5}
+    first = {"episodes": 0, "return": None, "missing_ratio": 0.1, "log_likelihood": 1.5}
+    rows = [{"frames": n, **(first if n == frames[0] else last)} for n in frames]
+    speeds = [{"steps_per_second": 100.0 if n == frames[0] else 200.0} for n in frames]
+    curve = pd.DataFrame([row | speed for row, speed in zip(rows, speeds, strict=True)])
+    curve.to_csv(folder / "metrics.csv", index=False)
+    numbers = {"return_std": 1.0, "length_mean": 9.0, "missing_ratio": 0.25, "log_likelihood": 1.0}
+    evaluations = [
+        {"frames": n, "kind": kind, "mode": mode, "episodes": 3, "return_mean": final} | numbers
+        for n, kind in ((200, "training"), (400, "final"))
+        for mode in ("sampled", "mean")
+        if n <= frames[-1]
+    ]
+    pd.DataFrame(evaluations).to_csv(folder / "evaluation.csv", index=False)
+    found = {"none:0": (90.0, 110.0), "mcar:0.5": (80.0, 90.0)} if points is None else points
+    write_table(folder / "robustness.csv", episodes(found))
+    return folder
+
+
+def report(folders: list[Path] | str, out: Path, **options: Any) -> str:
+    wanted = folders if isinstance(folders, str) else [str(folder) for folder in folders]
+    assert run(ASKED | {"run": wanted, "out": str(out)} | options) == 0
+    return (out / "README.md").read_text()
+
+
+def row(out: Path, point: str, mode: str = "sampled", table: str = "summary", **where: Any) -> Any:
+    rows = pd.read_csv(out / f"{table}.csv", keep_default_na=False, na_values=[""])
+    for name, value in ({"point": point, "mode": mode} | where).items():
+        rows = rows[rows[name] == value]
+    assert len(rows) == 1, (point, mode, where, rows)
+    return rows.iloc[0]
 
 
 @pytest.fixture
 def seeds(tmp_path: Path) -> list[Path]:
-    return [make_run(tmp_path / "runs" / f"s{s}", seed=s, final=50.0 + s) for s in (0, 1, 2)]
+    """Three seeds of one method: 40, 50, 90."""
+    finals = enumerate((40.0, 50.0, 90.0))
+    return [make_run(tmp_path / "runs" / f"s{i}", seed=i, final=value) for i, value in finals]
 
 
-# What is in it --------------------------------------------------------------------------------
+# Statistics -------------------------------------------------------------------------------------
 
 
-def test_the_mean_over_seeds_stands_beside_every_seeds_own_number(
+def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side() -> None:
+    values = np.array([[100.0, 1.0, 2.0, 3.0], [-7.0, 5.0, 5.0, 90.0]])
+    assert interquartile_mean(values).tolist() == [2.5, 5.0]
+    assert interquartile_mean(np.array([1.0, 2.0, 6.0])) == 3.0  # of three none is left out
+    eight = np.arange(8.0) ** 2
+    assert interquartile_mean(eight[:3], eight[3:]) == eight[2:6].mean()
+
+
+def test_the_interval_of_few_runs_is_their_range_and_of_one_run_nothing() -> None:
+    # One of 27 resamples is three times the lowest run: more than one in forty.
+    assert interval([6.0, 1.0, 2.0]) == (1.0, 6.0)
+    assert interval([6.0, 1.0]) == (1.0, 6.0)
+    assert np.isnan(interval([6.0])).all()
+
+
+def test_the_interval_of_many_runs_agrees_with_the_normal_approximation() -> None:
+    values = np.random.default_rng(0).normal(size=400)
+    half = 1.96 * values.std() / np.sqrt(400)
+    mean = lambda sample, axis: sample.mean(axis)  # noqa: E731
+    ends = interval(values, statistic=mean)
+    np.testing.assert_allclose(ends, [values.mean() - half, values.mean() + half], atol=0.01)
+    assert interval(values, statistic=mean) == ends  # the same at every call
+
+
+def test_runs_are_resampled_within_their_task_and_curves_as_a_whole() -> None:
+    assert interval([1.0, 1.0], [5.0, 5.0]) == (3.0, 3.0)
+    curves = np.array([[1.0, 2.0, 4.0], [5.0, 6.0, 4.0]])
+    low, high = interval(curves)
+    assert [(low[i], high[i]) for i in (0, 1)] == [interval(curve) for curve in curves]
+
+
+def test_the_probability_of_improvement_counts_pairs() -> None:
+    first, second = np.array([3.0, 5.0]), np.array([1.0, 3.0, 9.0])
+    # Of six pairs 3 > 1, 5 > 1, 5 > 3 are won and 3 = 3 is half won.
+    assert probability_of_improvement(first, second) == pytest.approx(3.5 / 6)
+    always = probability_of_improvement(first, second, np.array([9.0]), np.array([1.0]))
+    assert always == pytest.approx((3.5 / 6 + 1) / 2)
+    assert ratio(first, second[:2]) == 2.0
+
+
+# Names ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("belief", BELIEFS)
+def test_a_run_is_called_by_its_belief_unless_it_is_named(belief: str) -> None:
+    config = make_config(f"belief={belief}")
+    assert method_name(config) == belief
+    assert method_name(config | {"method": "mine"}) == "mine"
+    assert method_name(make_config(f"belief={belief}", "algo=acktr")) == f"{belief} (acktr)"
+
+
+def test_labels_tell_what_differs_and_nothing_else() -> None:
+    mar, clean = ("gru", "mar:0.5", 1.0), ("gru", "none:0", 1.0)
+    other, loud = ("drbpn", "mar:0.5", 1.0), ("gru", "mar:0.5", 3.0)
+    assert training_labels([mar, other]) == {mar: "gru", other: "drbpn"}
+    assert training_labels([mar, loud, clean])[loud] == "gru, mar:0.5, sigma 3"
+
+
+def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it() -> None:
+    assert point_kind("reduction:0.5:random") == ("reduction random", 0.5)
+    assert point_kind("outages:0.5:20:joint") == ("outages 0.5 joint", 20.0)
+    assert point_kind("spikes:0.05:5") == ("spikes 5", 0.05)
+    shuffled = ["mcar:0.8", "none:0", "noise:10", "mcar:0.2", "training", "noise:3"]
+    ordered = sorted(shuffled, key=dict(zip(shuffled, point_order(pd.Series(shuffled)), strict=True)).get)  # fmt: skip # noqa: E501
+    assert ordered == ["training", "none:0", "mcar:0.2", "mcar:0.8", "noise:3", "noise:10"]
+    outages = make_config("missingness=outages", "missingness.mean_length=20")["missingness"]
+    assert missingness_point(outages).endswith(":20:sensor")
+
+
+# Tables -----------------------------------------------------------------------------------------
+
+
+def test_means_over_seeds_stand_beside_every_seeds_own_number(
     seeds: list[Path], tmp_path: Path
 ) -> None:
+    page = report(seeds, tmp_path / "out")
+    training = row(tmp_path / "out", "training")
+    assert (training["return"], training.low, training.high) == (60, 40, 90)
+    assert training.per_seed == "0=40 1=50 2=90"
+    assert training.missing_ratio == pytest.approx((0.1 + 3 * 0.3) / 4)  # over all rollouts
+    assert training.steps_per_second == pytest.approx(4 / (1 / 100 + 3 / 200))
+    assert "**60** [40, 90]" in page
+    assert row(tmp_path / "out", "mar:0.5", "mean")["return"] == 60  # the run's own, at the end
+
+
+def test_episodes_are_summed_up_over_their_steps_and_shares_are_of_means(tmp_path: Path) -> None:
+    points = [{"none:0": (90.0, 110.0), "mcar:0.5": (80.0, 90.0)}, {"none:0": (10.0,), "mcar:0.5": (20.0,)}]  # fmt: skip # noqa: E501
+    folders = [make_run(tmp_path / f"s{i}", seed=i, points=p) for i, p in enumerate(points)]
+    page = report(folders, tmp_path / "out")
+    half = row(tmp_path / "out", "mcar:0.5")
+    assert half["return"] == (85 + 20) / 2
+    assert half.share == pytest.approx((85 + 20) / (100 + 10), rel=1e-5)  # not (0.85 + 2) / 2
+    assert " 95%" in page
+    table = pd.DataFrame(episodes({"mcar:0.5": (1.0, 2.0)})).assign(missing_ratio=[0.2, 0.6])
+    found = over_episodes(table.assign(log_likelihood=[1.0, 2.0], diverged=[0, 1])).iloc[0]
+    assert found.missing_ratio == pytest.approx((0.2 * 10 + 0.6 * 30) / 40)
+    assert found.log_likelihood == pytest.approx((1.0 * 8 + 2.0 * 12) / 20)
+    assert (found.return_mean, found.diverged, found.episodes) == (1.5, 0.5, 2)
+
+
+def test_a_mean_that_lacks_a_seed_is_not_given(seeds: list[Path], tmp_path: Path) -> None:
+    (seeds[1] / "robustness.csv").unlink()
     report(seeds, tmp_path / "out")
-    row = quantity(tmp_path / "out", "training return")
-    assert (row["mean"], row["std"], row["seeds"]) == ("51", "1", "3")
-    assert row["per_seed"] == "0=50 1=51 2=52"
-    assert (
-        "**51.00** [50.00, 52.00] (50.00, 51.00, 52.00)"
-        in (tmp_path / "out" / "README.md").read_text()
-    )
+    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
+    assert "mcar:0.5" not in set(summary.point)
+    assert "training" in set(summary.point)
 
 
-def test_means_over_a_run_weigh_every_rollout_the_same(seeds: list[Path], tmp_path: Path) -> None:
-    report(seeds[:1], tmp_path / "out")
-    # Three rollouts at .3 and one at .1; 400 frames in 100/100 + 300/200 seconds.
-    assert quantity(tmp_path / "out", "training missing ratio")["mean"] == "0.25"
-    assert quantity(tmp_path / "out", "training steps/s")["mean"] == "160"
-    assert quantity(tmp_path / "out", "training return")["std"] == ""
+def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "a")
+    write_table(folder / "points.csv", episodes({"mcar:0.5": (1.0, 1.0), "nmar:0.5": (7.0, 7.0)}))
+    report([folder], tmp_path / "out")
+    assert row(tmp_path / "out", "mcar:0.5")["return"] == 85
+    assert row(tmp_path / "out", "nmar:0.5")["return"] == 7
 
 
-def test_episodes_of_a_point_are_summed_up_over_their_steps(
-    seeds: list[Path], tmp_path: Path
-) -> None:
-    report(seeds, tmp_path / "out")
-    rows = table(tmp_path / "out" / "evaluation.csv")
-    assert len(rows) == 3 * (4 + 2)
-    (point,) = [r for r in rows if r["seed"] == "1" and r["point"] == "mcar:0.5"]
-    assert (point["source"], point["episodes"], point["return_mean"]) == ("points", "2", "85")
-    assert (point["length_mean"], point["missing_ratio"]) == ("20", "0.5")
-    kept = quantity(tmp_path / "out", "evaluation return kept", point="mcar:0.5", mode="sampled")
-    assert kept["mean"] == "0.85"
+def test_episodes_whose_belief_diverged_are_told(seeds: list[Path], tmp_path: Path) -> None:
+    table = pd.DataFrame(episodes({"none:0": (90.0, 110.0), "mcar:0.5": (80.0, 90.0)}))
+    table.loc[2, "diverged"] = 1
+    write_table(seeds[0] / "robustness.csv", table)
+    assert "85% (diverged: 17%)" in report(seeds, tmp_path / "out")  # one of six
 
 
-def test_a_mean_that_lacks_a_seed_is_not_given(tmp_path: Path) -> None:
-    folders = [make_run(tmp_path / f"s{s}", seed=s, points=s == 0) for s in (0, 1)]
+def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path: Path) -> None:
+    kinds = [(), ("optim.lr=0.1",), ("missingness.eta=0.2",), ("noise.sigma=3",), ("env=ant",)]
+    kinds += [("loss.model_coeff=0", "method=ppo_ours"), ("noise=spikes",)]
+    folders = [
+        make_run(tmp_path / f"{i}-{seed}", *kind, seed=seed, final=10.0 * i)
+        for i, kind in enumerate(kinds)
+        for seed in (0, 1)
+    ]
+    page = report(folders, tmp_path / "out")
+    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
+    training = summary[summary.point == "training"]
+    assert sorted(training["return"]) == [10.0 * i for i in range(len(kinds))]
+    assert (training.seeds == 2).all()
+    faster = training[training["return"] == 10.0].settings
+    assert faster.tolist() == ["optim.lr=0.1"]
+    assert "| ppo_ours" in page
+
+
+def test_the_reference_is_compared_where_half_is_missing_and_at_equal_steps(tmp_path: Path) -> None:
+    points = {"none:0": (100.0,), "mcar:0.5": (60.0,)}
+    folders = [make_run(tmp_path / f"a{i}", seed=i, final=40.0 + i, points=points) for i in (0, 1)]
+    points = {"none:0": (100.0,), "mcar:0.5": (50.0,)}
+    short = ("belief=dvrl", "total_frames=200")
+    for i in (0, 1):
+        path = make_run(tmp_path / f"b{i}", *short, seed=i, final=20.0, frames=[100, 200])
+        rows = pd.DataFrame(episodes(points)).assign(frames=200)
+        write_table(path / "robustness.csv", rows)
+        evaluation = pd.read_csv(path / "evaluation.csv").assign(kind="final")
+        write_table(path / "evaluation.csv", evaluation)
+        folders.append(path)
+    page = report(folders, tmp_path / "out")
+    half = row(tmp_path / "out", "mcar:0.5", table="comparison")
+    assert (half.over, half.margin, half.probability) == ("dvrl", 0.2, 1.0)
+    assert (half.steps, half.steps_over, half.paper) == (400, 200, 0.2)
+    equal = row(tmp_path / "out", "training", table="comparison")
+    assert equal.margin == pytest.approx(40.5 / 20 - 1)
+    assert (equal.steps, equal.steps_over) == (200, 200)
+    assert "400 and 200" in page
+
+
+def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Path) -> None:
+    folders = [
+        make_run(tmp_path / f"{env}{seed}", f"env={env}", seed=seed, points={"none:0": (value,)})
+        for env, value in (("hopper", 2000.0), ("walker2d", 1500.0), ("reacher", -5.0))
+        for seed in (0, 1)
+    ]
     report(folders, tmp_path / "out")
-    row = quantity(tmp_path / "out", "evaluation return", point="mcar:0.5")
-    assert (row["mean"], row["per_seed"]) == ("", "0=85 1=")
-    assert "| mcar:0.5 |  | **none** |" in (tmp_path / "out" / "README.md").read_text()
+    score = row(tmp_path / "out", "none:0", table="aggregate")
+    assert (score.tasks, score.runs) == (2, 4)
+    assert (score.score, score.low, score.high) == (0.75, 0.75, 0.75)
+
+
+def test_sample_efficiency_is_told_of_complete_exact_observations(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "a", "experiment=clean", "total_frames=400", final=2500.0)
+    table = pd.DataFrame({"frames": [*range(1, 12), 3_000_000], "return": [*range(11), 10**6]})
+    write_table(folder / "episodes.csv", table)  # the last one comes after 2M steps
+    study = read_runs([folder])
+    assert study.runs.top_10_return.item() == np.arange(1, 11).mean()
+    assert study.runs.steps_to_threshold.item() == 200  # the first row of 100 episodes or more
+    assert "## Sample efficiency" in report([folder], tmp_path / "out")
+    assert "Sample eff" not in report([make_run(tmp_path / "b")], tmp_path / "other")
 
 
 def test_learning_curves_are_thinned_over_the_whole_run(seeds: list[Path], tmp_path: Path) -> None:
     report(seeds, tmp_path / "out", rows=2)
-    rows = [row for row in table(tmp_path / "out" / "training.csv") if row["seed"] == "2"]
-    assert [row["frames"] for row in rows] == ["200", "400"]
-    assert [row["missing_ratio"] for row in rows] == ["0.2", "0.3"]
+    curve = pd.read_csv(tmp_path / "out" / "training.csv").query("seed == 1")
+    assert curve.frames.tolist() == [200, 400]
+    np.testing.assert_allclose(curve.missing_ratio, [0.2, 0.3])
 
 
-def test_tasks_and_corruptions_have_means_of_their_own(tmp_path: Path) -> None:
-    folders = [
-        make_run(tmp_path / "a", final=10.0),
-        make_run(tmp_path / "b", "env=walker2d", "env.version=v4", final=20.0),
-        make_run(tmp_path / "c", "missingness=mcar", "missingness.eta=0.2", final=30.0),
-    ]
-    report(folders, tmp_path / "out")
-    rows = [
-        r for r in table(tmp_path / "out" / "summary.csv") if r["quantity"] == "training return"
-    ]
-    found = [(row["task"], row["trained_on"], row["mean"]) for row in rows]
-    assert found == [
-        ("Hopper-v4", "mar:0.5", "10"),
-        ("Hopper-v4", "mcar:0.2", "30"),
-        ("Walker2d-v4", "mar:0.5", "20"),
-    ]
+# Making it again --------------------------------------------------------------------------------
 
 
-def test_figures_are_drawn_and_a_stale_one_does_not_stay(seeds: list[Path], tmp_path: Path) -> None:
+def test_the_tables_alone_give_the_same_page_and_keep_the_notes(
+    seeds: list[Path], tmp_path: Path
+) -> None:
     out = tmp_path / "out"
-    report(seeds, out)
-    for name in ("learning_curves.png", "robustness.png"):
-        assert (out / name).read_bytes().startswith(b"\x89PNG")
-        assert (out / name).stat().st_size > 10_000
-    for folder in seeds:
-        (folder / "points.csv").unlink()
-    report(seeds, out)
-    assert not (out / "robustness.png").exists()
-    assert "robustness.png" not in (out / "README.md").read_text()
+    report(seeds, out, title="Three seeds")
+    (out / "notes.md").write_text("What to conclude.")
+    (out / "robustness_mean_actions.png").write_text("of an earlier report")
+    page = report(seeds, out)
+    assert page.startswith("# Three seeds\n\nWhat to conclude.\n")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert {"learning_curves.png", "robustness.png", "summary.csv", "runs.csv"} <= before.keys()
+    assert "robustness_mean_actions.png" not in before  # no kind has two levels of mean actions
+    shutil.rmtree(tmp_path / "runs")
+    assert run(ASKED | {"from": str(tmp_path / "o*")}) == 0
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_versions_that_differ_are_told_run_by_run(tmp_path: Path) -> None:
-    folders = [
-        make_run(tmp_path / f"s{s}", seed=s, versions=VERSIONS | {"torch": f"2.13.{s}"})
-        for s in (0, 1)
-    ]
-    report(folders, tmp_path / "out")
-    page = (tmp_path / "out" / "README.md").read_text()
-    assert "- torch: 2.13.0 (s0); 2.13.1 (s1)\n" in page
-    assert "- python: 3.11.7\n" in page
-    assert "platform" not in page
-    assert str(tmp_path) not in page
-
-
-# Beside the paper -----------------------------------------------------------------------------
-
-
-def test_margins_over_other_methods_stand_beside_those_of_the_paper(tmp_path: Path) -> None:
-    finals = {"drbpn": (240.0, 260.0), "dvrl": (90.0, 110.0), "fill": (400.0, 600.0)}
-    folders = [
-        make_run(tmp_path / f"{m}{s}", method=m, seed=s, final=returns[s], points=False)
-        for m, returns in finals.items()
-        for s in (0, 1)
-    ]
-    report(folders, tmp_path / "out")
-    rows = [row for row in table(tmp_path / "out" / "margins.csv") if row["mode"] == "sampled"]
-    assert [(row["over"], row["margin"], row["paper"]) for row in rows] == [
-        ("dvrl", "1.5", "0.2"),  # Hopper
-        ("fill", "-0.5", ""),
-    ]
-    # 240 / 110 and 260 / 90 are the extremes of 16 resamples.
-    assert [float(rows[0][end]) for end in ("low", "high")] == pytest.approx(
-        [240 / 110 - 1, 260 / 90 - 1], abs=1e-5
-    )
-    page = (tmp_path / "out" / "README.md").read_text()
-    assert "| mar:0.5 | sampled actions | `dvrl` | 400 | +150 % [+" in page
-    assert "python recipes/study.py study=grid\n" in page
-    assert "python recipes/report.py 'run=runs/grid/*' out=results/out rows=100\n" in page
-
-
-def test_runs_of_unequal_length_are_compared_at_equal_steps_too(tmp_path: Path) -> None:
-    """The other method was stopped at 200 steps: as long as it ran, drbpn had 20, it had 40."""
-    for seed in (0, 1):
-        folder = make_run(tmp_path / f"d{seed}", method="drbpn", seed=seed, final=80.0)
-        rows = table(folder / "metrics.csv")
-        for row in rows[:2]:
-            row["return"] = "20"
-        write_table(folder / "metrics.csv", rows)
-        name = tmp_path / f"p{seed}"
-        make_run(name, "total_frames=200", frames=[100, 200], method="dvrl", seed=seed, final=40.0)
-        (name / "points.csv").unlink()
-        evaluated = table(name / "evaluation.csv")
-        for row in evaluated:
-            row["kind"] = "final"
-        write_table(name / "evaluation.csv", evaluated[:2])
-    report([tmp_path / n for n in ("d0", "d1", "p0", "p1")], tmp_path / "out")
-    rows = [r for r in table(tmp_path / "out" / "margins.csv") if r["mode"] == "sampled"]
-    found = [(r["point"], r["steps"], r["steps_over"], r["margin"]) for r in rows]
-    assert found == [("mar:0.5", "400", "200", "1"), ("training", "200", "200", "-0.5")]
-    page = (tmp_path / "out" / "README.md").read_text()
-    assert "| `dvrl` | 400 and 200 | +100 % [+100 %, +100 %] | +20 % |" in page
-    assert "| training | sampled actions | `dvrl` | 200 | -50 % [-50 %, -50 %] | +20 % |" in page
-
-
-def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Path) -> None:
-    finals = {"hopper": (1000.0, 3000.0), "walker2d": (3000.0, 6000.0)}  # thresholds 2000, 3000
-    folders = [
-        make_run(tmp_path / f"{t}{s}", f"env={t}", "env.version=v4", seed=s, final=f, points=False)
-        for t, returns in finals.items()
-        for s, f in enumerate(returns)
-    ]
-    # A method with one task only is not compared with one that has both.
-    folders.append(make_run(tmp_path / "gru", "belief=gru", points=False))
-    report(folders, tmp_path / "out")
-    rows = [r for r in table(tmp_path / "out" / "aggregate.csv") if r["mode"] == "sampled"]
-    assert [(r["method"], r["iqm"], r["runs"]) for r in rows] == [("drbpn", "1.25", "4")]
-
-
-@pytest.fixture
-def clean_run(tmp_path: Path) -> StudyRun:
-    folder = make_run(tmp_path / "clean", "experiment=clean", "env.version=v4", points=False)
-    episodes = [{"frames": 10 * i, "return": float(i), "length": 10} for i in range(1, 31)]
-    episodes.append({"frames": 2_000_001, "return": 1e9, "length": 10})  # too late
-    Table(folder / "episodes.csv", ("frames", "return", "length")).append(episodes)
-    (run_read,) = read_study([folder])
-    return run_read
-
-
-def test_the_top_ten_are_the_best_episodes_within_two_million_steps(clean_run: StudyRun) -> None:
-    assert top_return(clean_run) == np.mean(range(21, 31))
-    assert top_return(dataclasses.replace(clean_run, episodes=clean_run.episodes[:9])) is None
-
-
-def test_a_threshold_is_reached_by_a_mean_of_a_hundred_episodes(clean_run: StudyRun) -> None:
-    def steps(*rows: tuple[int, int, float | None]) -> int | None:
-        keys = ("frames", "episodes", "return")
-        training = [dict(zip(keys, row, strict=True)) for row in rows]
-        return steps_to_threshold(dataclasses.replace(clean_run, training=training), 2000.0)
-
-    lucky, good, bad = (2048, 7, 2500.0), (8192, 130, 2001.0), (6144, 120, 1999.0)
-    assert steps((1024, 0, None), lucky, (4096, 100, None), bad, good) == 8192
-    assert steps(lucky, bad) is None
-    assert steps((2_000_001, 900, 2500.0)) is None
-
-
-def test_runs_with_spikes_are_not_complete_and_exact_and_have_a_mean_of_their_own(
-    tmp_path: Path,
+@pytest.mark.parametrize("name", ["acktr-v4-1m", "clean-v4-1m", "methods-v4-500k"])
+def test_committed_tables_and_pages_are_what_the_committed_runs_give(
+    name: str, tmp_path: Path
 ) -> None:
-    spikes = ("noise=spikes", "noise.sigma=0", "noise.spike_probability=0.1", "noise.spike_std=5")
-    make_run(tmp_path / "exact", "experiment=clean", "env.version=v4")
-    make_run(tmp_path / "spiked", "experiment=clean", "env.version=v4", *spikes, final=10.0)
-    report([tmp_path / "exact", tmp_path / "spiked"], tmp_path / "out")
-    assert len(table(tmp_path / "out" / "efficiency.csv")) == 1
-    row = quantity(tmp_path / "out", "training return", trained_on="none:0 spikes:0.1:5")
-    assert row["mean"] == "10"
+    copy = tmp_path / name
+    shutil.copytree(ROOT / "results" / name, copy)
+    assert run(ASKED | {"from": str(copy)}) == 0
+    for written in WRITTEN:
+        committed = ROOT / "results" / name / written
+        assert committed.is_file() == (copy / written).is_file()
+        if committed.is_file():
+            assert (copy / written).read_text() == committed.read_text(), written
 
 
-def test_sample_efficiency_is_told_of_clean_runs_and_says_what_was_not_reached(
-    clean_run: StudyRun, tmp_path: Path
-) -> None:
-    del clean_run  # written
-    make_run(tmp_path / "noisy", points=False)
-    report([tmp_path / "clean", tmp_path / "noisy"], tmp_path / "out")
-    rows = table(tmp_path / "out" / "efficiency.csv")
-    assert [(r["task"], r["threshold"], r["steps_to_threshold"]) for r in rows] == [
-        ("Hopper-v4", "2000", "")
-    ]
-    page = (tmp_path / "out" / "README.md").read_text()
-    assert "| `drbpn` | 0 | **25.50** (25.50) | 2000 | not reached in 400 |" in page
+def test_results_stay_small() -> None:
+    size = sum(path.stat().st_size for path in (ROOT / "results").rglob("*") if path.is_file())
+    assert size < 10e6
+    assert len(STUDIES) >= 12
 
 
-# Points ---------------------------------------------------------------------------------------
+# The figure of an evaluation --------------------------------------------------------------------
 
 
-def test_points_of_one_kind_differ_in_one_number() -> None:
-    names = ["none:0", "mcar:0.5", "reduction:0.4:model", "outages:0.5:20:sensor", "spikes:0.1:10"]
-    assert [point_kind(name) for name in names] == [
-        "none",
-        "mcar",
-        "reduction model",
-        "outages 0.5 sensor",
-        "spikes 10",
-    ]
-    assert [point_order(name)[1] for name in names] == [0.0, 0.5, 0.4, 20.0, 0.1]
-    assert point_order("outages:0.5")[1] == 0.5
-    assert sorted(["mcar:0.2", "none:0", "mar:0.5"], key=point_order)[0] == "none:0"
+def test_an_evaluation_draws_methods_noise_and_runs_of_one_seed_apart() -> None:
+    def rows(run: str, method: str, sigma: float, value: float) -> Any:
+        table = pd.DataFrame(episodes({"mcar:0.2": (value,), "mcar:0.5": (value,)}, "mean"))
+        agent = {"run": run, "env": "Hopper-v4", "method": method, "trained_on": "mar:0.5"}
+        return table.assign(**agent, trained_noise_sigma=sigma, noise_sigma=0, training_seed=0)
+
+    two = pd.concat([rows("a", "drbpn", 1.0, 3000.0), rows("b", "ppo_ours", 1.0, 100.0)])
+    (figure,) = draw_evaluation(two).values()
+    drawn = {line.get_label(): set(line.get_ydata()) for line in figure.axes[0].get_lines()}
+    assert drawn == {"drbpn": {3000.0}, "ppo_ours": {100.0}}
+    noises = pd.concat([rows("a", "drbpn", 1.0, 1.0), rows("b", "drbpn", 3.0, 3.0)])
+    (figure,) = draw_evaluation(noises).values()
+    assert [x.get_label() for x in figure.axes[0].get_lines()] == ["drbpn, sigma 1", "drbpn, sigma 3"]  # fmt: skip # noqa: E501
+    twins = pd.concat([rows("a", "drbpn", 1.0, 1.0), rows("b", "drbpn", 1.0, 3.0)])
+    assert sorted(set(episode_summary(twins).settings)) == ["a", "b"]
+    seeds = twins.assign(training_seed=(twins.run == "b").astype(int))
+    summary = episode_summary(seeds)
+    assert set(summary["return"]) == {2.0}
+    assert (summary.low.iloc[0], summary.high.iloc[0]) == (1.0, 3.0)
 
 
-def test_points_go_by_the_name_that_the_evaluation_gave_them(tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run")
-    rows = table(folder / "points.csv")
-    for row in rows:  # two ways of taking sensors away, which mechanism and eta do not tell apart
-        if row["mechanism"] == "mcar":
-            row["mechanism"], row["eta"] = "none", "0"
-            row["point"] = f"reduction:0.5:{'model' if row['episode'] == '0' else 'random'}"
-    for row in rows:
-        row.setdefault("point", "none:0")
-    write_table(folder / "points.csv", rows)
-    report([folder], tmp_path / "out")
-    means = {
-        row["point"]: row["return_mean"]
-        for row in table(tmp_path / "out" / "evaluation.csv")
-        if row["source"] == "points"
-    }
-    assert means == {"none:0": "100", "reduction:0.5:model": "80", "reduction:0.5:random": "90"}
+# What a user gets wrong -------------------------------------------------------------------------
 
 
-def episodes(folder: Path, name: str, seed: int, returns: dict[str, list[float]]) -> None:
-    """Write a table of recipes/evaluate.py: returns of episodes by point."""
-    write_table(
-        folder / name,
-        [
-            {"frames": 400, "mechanism": "mcar", "eta": 0.5, "point": point, "mode": "sampled"}
-            | {"episode": i, "return": value, "length": 10, "missing_ratio": 0.5, "seed": seed}
-            for point, values in returns.items()
-            for i, value in enumerate(values)
-        ],
-    )
-
-
-def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path: Path) -> None:
-    """Five episodes of one seed and two of another are neither seven nor five of both."""
-    folder = make_run(tmp_path / "run", points=False)
-    episodes(folder, "points.csv", 99, {"mcar:0.5": [1.0] * 5, "mcar:0.3": [7.0]})
-    episodes(folder, "robustness.csv", 1, {"mcar:0.5": [10.0, 20.0]})
-    report([folder], tmp_path / "out")
-    found = {
-        row["point"]: (row["table"], row["episode_seed"], row["episodes"], row["return_mean"])
-        for row in table(tmp_path / "out" / "evaluation.csv")
-        if row["source"] == "points"
-    }
-    assert found == {
-        "mcar:0.5": ("robustness.csv", "1", "2", "15"),
-        "mcar:0.3": ("points.csv", "99", "1", "7"),
-    }
-
-
-# Commands -------------------------------------------------------------------------------------
-
-
-def commands(page: Path, program: str) -> list[str]:
-    return [line for line in page.read_text().splitlines() if f"recipes/{program}" in line]
-
-
-def test_the_evaluation_of_a_mixed_study_asks_no_agent_for_a_model_that_it_lacks(
-    tmp_path: Path,
-) -> None:
-    """Points of the grid are asked for as the grid, which knows; others run by run."""
-    grid = {"none:0": [1.0] * 30, "mcar:0.5": [1.0] * 30}
-    for method in ("drbpn", "gru"):
-        name = tmp_path / "runs" / method
-        folder = make_run(name, f"belief={method}", method=method, points=False)
-        model = {"reduction:0.5:model": [1.0] * 30} if method == "drbpn" else {}
-        episodes(folder, "robustness.csv", 10_000, grid | model)
-    report(str(tmp_path / "runs" / "*"), tmp_path / "out")
-    page = tmp_path / "out" / "README.md"
-    every = "for run in $(dirname runs/grid/*/config.yaml)"
-    assert commands(page, "evaluate.py")[0] == (
-        f"{every}; do python recipes/evaluate.py run=$run 'modes=[sampled]'; done"
-    )
-    for method in ("drbpn", "gru"):
-        folder = tmp_path / "runs" / method
-        (folder / "robustness.csv").rename(folder / "points.csv")
-    report(str(tmp_path / "runs" / "*"), tmp_path / "out")
-    first, second = commands(page, "evaluate.py")
-    assert first.startswith("for run in runs/grid/drbpn; do")
-    assert "reduction:0.5:model" in first
-    assert second.startswith("for run in runs/grid/gru; do")
-    assert "points=[none:0,mcar:0.5]" in second
-
-
-def test_the_command_of_an_evaluation_names_what_is_not_the_default(tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run", points=False)
-    episodes(folder, "robustness.csv", 7, {"nmar:0.5": [1.0] * 5, "spikes:0.05:5": [1.0] * 5})
-    report([folder], tmp_path / "out")
-    (line,) = commands(tmp_path / "out" / "README.md", "evaluate.py")
-    words = "full=true episodes=5 'modes=[sampled]' seed=7"
-    assert line == f"python recipes/evaluate.py run=runs/run {words}"
-    episodes(folder, "robustness.csv", 7, {"nmar:0.55": [1.0] * 5})  # on no grid
-    report([folder], tmp_path / "out")
-    (line,) = commands(tmp_path / "out" / "README.md", "evaluate.py")
-    assert "'points=[nmar:0.55]' episodes=5" in line
-
-
-# Rebuilding -----------------------------------------------------------------------------------
-
-
-def test_the_same_run_folders_give_the_same_bytes(seeds: list[Path], tmp_path: Path) -> None:
-    report(seeds, tmp_path / "first" / "study")
-    moved = shutil.copytree(tmp_path / "runs", tmp_path / "elsewhere")
-    report(str(moved / "*"), tmp_path / "second" / "study")
-    first, second = (sorted((tmp_path / n / "study").iterdir()) for n in ("first", "second"))
-    assert [p.name for p in first] == [p.name for p in second]
-    assert len(first) == 7
-    for one, other in zip(first, second, strict=True):
-        assert one.read_bytes() == other.read_bytes(), one.name
-
-
-def test_a_report_is_made_again_from_a_copy_of_what_is_committed(
-    seeds: list[Path], tmp_path: Path
-) -> None:
-    study = tmp_path / "results" / "study"
-    study.mkdir(parents=True)
-    (study / "notes.md").write_text("What we saw.\n\nMore of it.\n")
-    report(seeds, study, title='Three "seeds"', rows=3)
-    shutil.copytree(tmp_path / "runs", study / "runs")
-    clone = shutil.copytree(tmp_path / "results", tmp_path / "clone")
-    for path in (clone / "study").glob("*.*"):  # of what is committed, the made files
-        if path.name not in ("notes.md", "report.yaml"):
-            path.unlink()
-    run(ASKED | {"index": str(clone)})
-    for path in (p for p in study.iterdir() if p.is_file()):
-        assert (clone / "study" / path.name).read_bytes() == path.read_bytes(), path.name
-    index = (clone / "README.md").read_text()
-    assert '## [Three "seeds"](study/README.md)\n\nWhat we saw.\n' in index
-    assert "More of it" not in index
-    report([], study, run=None)  # once more, in its own place
-    run(ASKED | {"index": str(tmp_path / "results")})
-    assert (tmp_path / "results" / "README.md").read_text() == index
-    assert "# Three" in (study / "README.md").read_text()
-
-
-def test_the_committed_index_is_what_the_committed_tables_give() -> None:
-    """And those are what the committed runs give, as the next test says."""
-    results = ROOT / "results"
-    assert index_page(results, studies_of(results)) == (results / "README.md").read_text()
-
-
-def test_the_index_holds_the_tables_of_every_study_beside_the_papers_figures(
-    tmp_path: Path,
-) -> None:
-    results = tmp_path / "results"
-    for method, final in (("drbpn", 50.0), ("dvrl", 40.0)):
-        make_run(results / "gaps" / "runs" / method, method=method, final=final)
-    make_run(results / "clean" / "runs" / "a", "experiment=clean", "env.version=v4", points=False)
-    noisy = ("experiment=clean", "noise=gaussian", "noise.sigma=0.5", "env.version=v4")
-    make_run(results / "clean" / "runs" / "b", *noisy, final=7.0, points=False)
-    (results / "gaps" / "sensors").mkdir()
-    run(ASKED | {"index": str(results)})
-    clean, gaps = (results / "README.md").read_text().split("\n## ")[1:]
-    assert "| Hopper-v4 | `drbpn` | none:0, sigma 0 | 1 | **50.00** | **50.00** | 2000 |" in clean
-    assert "| Hopper-v4 | `drbpn` | none:0, sigma 0.5 | 1 | **7.00** | **7.00** |  |" in clean
-    assert "| task | method | trained on | seeds | training | none:0 | mcar:0.5 | mar:0.5 |" in gaps
-    line = "| Hopper-v4 | `dvrl` | mar:0.5, sigma 1 | 1 | **40.00** | **100** | **85.00** |"
-    assert line in gaps
-    line = "| Hopper-v4 | mar:0.5, sigma 1 | mar:0.5 | `dvrl` | 400 | +25 % | +20 % |"
-    assert line in gaps
-    assert "paper |" not in gaps.split("margin")[0]  # no threshold beside runs with gaps
-    assert "steps to it" not in gaps
-    _, lines = clean.split("| task | method | top-10 return of each seed | paper's threshold |")
-    (line,) = [line for line in lines.splitlines() if "`drbpn`" in line]
-    assert line.endswith("| 2000 | not reached |")
-    assert "Beside it: [sensors](gaps/sensors/)." in gaps
-    for study, text in (("clean", clean), ("gaps", gaps)):
-        assert (results / study / "learning_curves.png").is_file()
-        assert f"]({study}/learning_curves.png)" in text
-
-
-@pytest.mark.parametrize("study", COMMITTED, ids=lambda path: path.name)
-def test_committed_tables_are_what_their_runs_give(study: Path, tmp_path: Path) -> None:
-    copy = tmp_path / study.name
-    copy.mkdir()
-    for name in ("notes.md", "report.yaml"):
-        shutil.copy(study / name, copy / name)
-    report(str(study / "runs" / "*"), copy)
-    for path in (*study.glob("*.csv"), study / "README.md"):
-        assert (copy / path.name).read_bytes() == path.read_bytes(), path.name
-
-
-def test_the_command_of_a_run_gives_its_configuration_back(tmp_path: Path) -> None:
-    overrides = ("missingness=nmar", "experiment=paper", "belief=none", "heads.hidden=[8]")
-    folder = make_run(tmp_path / "odd", *overrides, "noise=none", seed=3)
-    (odd,) = read_study([folder])
-    program, *words = shlex.split(training_command(odd))[1:]
-    assert program == "recipes/ppo_drbpn.py"
-    again = make_config(*(word for word in words if not word.startswith("hydra.")))
-    assert flat(again) == flat(odd.config)
-
-
-def test_numbers_have_one_form() -> None:
-    numbers = (1.0, 1234567.8, 0.000123456789, -0.0, float("nan"), None, 3, 50.125)
-    assert [format_number(n) for n in numbers] == [
-        "1",
-        "1234568",
-        "0.000123457",
-        "0",
-        "",
-        "",
-        "3",
-        "50.125",
-    ]
-
-
-# Bad input ------------------------------------------------------------------------------------
-
-
-def test_a_run_that_is_not_finished_is_refused_unless_asked_for(tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "half", frames=[100, 200], points=False)
-    with pytest.raises(UserError, match=r"`half` has 200 of 400 steps.*unfinished=true"):
+def test_runs_that_are_not_finished_are_refused_unless_asked_for(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "a", frames=[100, 200])
+    with pytest.raises(UserError, match=r"`a` has 200 of 400 steps or lacks its final evaluation"):
         report([folder], tmp_path / "out")
-    report([folder], tmp_path / "out", unfinished=True)
-    page = (tmp_path / "out" / "README.md").read_text()
-    assert "`half` is not finished: 200 of 400 steps" in page
-    assert "unfinished=true" in page
-
-
-def test_a_run_before_its_first_rollout_is_listed_and_does_not_stop_the_report(
-    seeds: list[Path], tmp_path: Path
-) -> None:
-    begun = make_run(tmp_path / "runs" / "begun", seed=3)
-    header = (begun / "metrics.csv").read_text().splitlines()[0]
-    # A row that is being written while the report reads has no end.
-    with (seeds[2] / "metrics.csv").open("a") as file:
-        file.write("500,1.0")
-    for content in (f"{header}\n", None):
-        if content is None:
-            (begun / "metrics.csv").unlink()
-        else:
-            (begun / "metrics.csv").write_text(content)
-        with pytest.raises(UserError, match=r"metrics\.csv"):
-            report([*seeds, begun], tmp_path / "out")
-        report([*seeds, begun], tmp_path / "out", unfinished=True)
-        page = (tmp_path / "out" / "README.md").read_text()
-        assert "- `begun` has finished no rollout yet\n" in page
-        assert quantity(tmp_path / "out", "training return")["seeds"] == "3"
-        shutil.rmtree(tmp_path / "out")
-    with pytest.raises(UserError, match="`run` must name runs with a finished rollout, 1 have no"):
-        report([begun], tmp_path / "out", unfinished=True)
-
-
-def test_runs_that_make_no_mean_together_are_refused(tmp_path: Path) -> None:
-    first = make_run(tmp_path / "first")
-    with pytest.raises(UserError, match=r"`first` and `other` differ in optim.lr"):
-        read_study([first, make_run(tmp_path / "other", "optim.lr=0.5", seed=1)])
-    with pytest.raises(UserError, match=r"`first` and `twin` are the same .* seed 0"):
-        read_study([first, make_run(tmp_path / "twin")])
+    assert not (tmp_path / "out").exists()
+    assert "- `a` is not finished: 200 steps" in report([folder], tmp_path / "out", unfinished=True)
+    (folder / "evaluation.csv").unlink()
+    with pytest.raises(UserError, match="lacks its final evaluation"):
+        report([folder], tmp_path / "out")
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "message"),
+    ("options", "line"),
     [
-        ("metrics.csv", None, "`.*metrics.csv` can't be read"),
-        ("metrics.csv", "a,b\n1,2\n", "`.*metrics.csv` lacks the columns frames, missing_ratio"),
-        ("metrics.csv", "frames,return,missing_ratio\n", "metrics.csv is empty"),
-        ("versions.json", "{", "`.*versions.json` can't be read"),
-        ("config.yaml", None, "must be a run folder with config.yaml"),
-        ("config.yaml", "seed: 1\n", "`.*config.yaml`: .* must have the keys"),
+        ({"run": "nowhere/*"}, r"`run` must name run folders, nowhere/\* matches none"),
+        ({"run": "nowhere"}, "`run` must name run folders, there is no folder nowhere"),
+        ({"run": None}, "`run` must name run folders: 'run="),
+        ({"run": [], "out": None}, "`out` must be the folder of a study"),
+        ({"from": "nowhere"}, "`from` reads and writes the tables of a study: leave out `run`"),
+        ({"from": "nowhere", "run": None, "out": None}, "`from` must name folders with a runs.csv"),
+        ({"rows": 1}, "`rows` must be a whole number of at least 2, got 1"),
     ],
 )
-def test_a_bad_folder_is_answered_with_one_line_and_the_old_report_stays(
-    seeds: list[Path], tmp_path: Path, file: str, content: str | None, message: str
+def test_bad_options_are_one_line(options: dict[str, Any], line: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=line) as error:
+        run(ASKED | {"run": "x", "out": str(tmp_path / "out")} | options)
+    assert "\n" not in str(error.value)
+
+
+def test_a_bad_folder_is_one_line_and_the_old_report_stays(
+    seeds: list[Path], tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
-    report(seeds[:2], out)
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-    if content is None:
-        (seeds[2] / file).unlink()
-    else:
-        (seeds[2] / file).write_text(content)
-    with pytest.raises(UserError, match=message) as caught:
-        report(seeds, out)
-    assert "\n" not in str(caught.value)
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "runs"]
-
-
-def test_no_folder_at_all_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="matches none"):
-        find_folders(str(tmp_path / "*"))
-    with pytest.raises(UserError, match="`out` must be given"):
-        run(ASKED | {"run": str(tmp_path)})
-    with pytest.raises(UserError, match=r"out/runs/\* matches none"):
-        report([], tmp_path / "out", run=None)
-    with pytest.raises(UserError, match=r"`index` .* leave out `run` and `out`"):
-        run(ASKED | {"index": str(tmp_path), "out": "x"})
-    with pytest.raises(UserError, match=r"`index` must be a folder of studies .* holds none"):
-        run(ASKED | {"index": str(tmp_path)})
-    (tmp_path / "file").touch()
-    with pytest.raises(UserError, match="`out` must be a folder"):
-        report([], tmp_path / "file")
+    page = report(seeds, tmp_path / "out")
+    for name, content, line in (
+        ("metrics.csv", "frames,return\n1,2\n", "lacks the columns missing_ratio: is it another"),
+        ("metrics.csv", "frames\n1,2\n1,2,3\n", "can't be read as a table"),
+        ("metrics.csv", None, "can't be read as a table"),
+        ("config.yaml", "a: [", "config.yaml` can't be read as a configuration"),
+        ("config.yaml", None, "must be a run folder with config.yaml"),
+    ):
+        bad = shutil.copytree(seeds[0], tmp_path / "bad")
+        (bad / name).write_text(content) if content else (bad / name).unlink()
+        with pytest.raises(UserError, match=line) as error:
+            report([*seeds, bad], tmp_path / "out")
+        assert "\n" not in str(error.value)
+        shutil.rmtree(bad)
+    twin = shutil.copytree(seeds[0], tmp_path / "twin")
+    with pytest.raises(UserError, match="are the same task, method, settings and corruption with"):
+        report([*seeds, twin], tmp_path / "out")
+    assert (tmp_path / "out" / "README.md").read_text() == page

@@ -261,7 +261,6 @@ def identity(trained: TrainedAgent) -> dict[str, Any]:
     """
     settings = trained.settings
     return {
-        "study": trained.study,
         "env": settings.env.env_id,
         "belief": settings.belief.get("name", ""),
         "method": trained.method,

@@ -30,7 +30,7 @@ Row = Mapping[str, Any]
 
 # A table without one of these was written by an earlier version, or by another command.
 _COLUMNS = {
-    *("run", "study", "env", "belief", "method", "training_seed", "frames", "trained_on"),
+    *("run", "env", "belief", "method", "training_seed", "frames", "trained_on"),
     *("trained_noise_sigma", "point", "removed_by", "mode", "episode", "seed", "reduction_seed"),
 }
 _AGAIN = "name another `output`, or overwrite=true begins anew."

@@ -15,7 +15,7 @@ from training.console import say
 from training.envs import make_environment
 from training.errors import UserError
 from training.loop import make_agent
-from training.methods import method_label, read_cell
+from training.methods import method_name
 from training.run_folder import read_config
 
 from torchrl_drbpn import BeliefFilterModule
@@ -32,7 +32,6 @@ class TrainedAgent:
         statistics: an environment that holds the trained normalisation.
         frames: environment steps of the checkpoint.
         method: what it is called in tables and figures, see :mod:`training.methods`.
-        study: the study that it is of; None: it was trained by itself.
     """
 
     settings: Settings
@@ -41,7 +40,6 @@ class TrainedAgent:
     statistics: TransformedEnv
     frames: int
     method: str
-    study: str | None
 
 
 def load_trained_agent(folder: Path) -> TrainedAgent:
@@ -56,7 +54,8 @@ def load_trained_agent(folder: Path) -> TrainedAgent:
     Raises:
         UserError: if the folder or the checkpoint can't be used.
     """
-    settings = read_settings(read_config(folder))
+    config = read_config(folder)
+    settings = read_settings(config)
     path = last_checkpoint(folder)
     state = load_checkpoint(path)
     belief, agent = make_agent(settings)
@@ -80,9 +79,7 @@ def load_trained_agent(folder: Path) -> TrainedAgent:
         raise UserError(
             f"`{path}` does not fit {folder / 'config.yaml'}: {' '.join(str(error).split())[:300]}"
         ) from error
-    study, choices = read_cell(folder)
-    method = method_label(settings, choices)
-    return TrainedAgent(settings, belief, agent, statistics, frames, method, study)
+    return TrainedAgent(settings, belief, agent, statistics, frames, method_name(config))
 
 
 def gated(trained: TrainedAgent, gate: float | None) -> TrainedAgent:

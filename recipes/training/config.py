@@ -162,6 +162,7 @@ class Settings:
     evaluation: EvaluationSettings
     checkpoint: CheckpointSettings
     logger: LoggerSettings
+    method: str | None
     seed: int
     total_frames: int
     threads: int

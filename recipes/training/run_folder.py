@@ -56,6 +56,7 @@ _LATER_SETTINGS: dict[str, Any] = {
     "missingness.group_by": "sensor",
     "noise.spike_probability": 0.0,
     "noise.spike_std": 0.0,
+    "method": None,
 }
 
 

@@ -1,0 +1,300 @@
+"""Run folders as three tables: one row a run, a point of its learning curve, an evaluation."""
+
+from __future__ import annotations
+
+import glob
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from training.errors import UserError
+from training.methods import method_name
+from training.run_folder import read_config
+
+# A mean is taken over the seeds of one of these.
+GROUP = ["task", "method", "settings", "trained_on", "noise_sigma"]
+RUN = [*GROUP, "seed"]
+# Returns on complete, exact observations that the DRBPN paper asks for within 2M steps, v4.
+THRESHOLDS = {
+    "HalfCheetah": 2100.0,
+    "Hopper": 2000.0,
+    "Ant": 2500.0,
+    "Walker2d": 3000.0,
+    "InvertedDoublePendulum": 9100.0,
+    "InvertedPendulum": 950.0,
+    "Swimmer": 90.0,
+    "Reacher": -7.0,
+}
+WITHIN = 2_000_000  # environment steps
+EPISODE_TABLES = ("robustness.csv", "points.csv")  # of recipes/evaluate.py, in order of precedence
+# Settings that change no number that is reported, or are columns of their own.
+_NOT_COMPARED = ("seed", "threads", "resume", "logger", "checkpoint", "evaluation", "method")
+_VERSIONS = ("torch", "torchrl", "gymnasium", "mujoco", "git_commit")
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is known of a study; each table is a CSV file beside its page.
+
+    Attributes:
+        runs: one row a run: :data:`RUN`, frames, return of the last 100 episodes, versions.
+        training: learning curves.
+        evaluation: one row an evaluation of a run at a point.
+    """
+
+    runs: pd.DataFrame
+    training: pd.DataFrame
+    evaluation: pd.DataFrame
+
+    def write(self, folder: Path) -> None:
+        """Write the tables, six significant digits."""
+        for field in fields(self):
+            write_table(folder / f"{field.name}.csv", getattr(self, field.name))
+
+    @classmethod
+    def read(cls, folder: Path) -> Study:
+        """Read the tables that :meth:`write` has written."""
+        tables = [read_table(folder / f"{field.name}.csv", RUN) for field in fields(cls)]
+        for table in tables:
+            for name in {"settings", "overrides"} & {*table}:  # empty: a column without a text
+                table[name] = table[name].astype(str).fillna("")
+        return cls(*tables)
+
+
+def write_table(path: Path, rows: Any) -> None:
+    """Write a CSV file, numbers with six significant digits."""
+    pd.DataFrame(rows).to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
+
+
+def read_table(path: Path, needed: Iterable[str]) -> pd.DataFrame:
+    """Read a CSV file; a last row without an end, of a run under way, is left out.
+
+    Raises:
+        UserError: if it can't be read or lacks one of the columns ``needed``.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        whole = io.StringIO(text[: text.rfind("\n") + 1])
+        table = pd.read_csv(whole, keep_default_na=False, na_values=[""])
+    except (OSError, ValueError) as error:
+        raise UserError(f"`{path}` can't be read as a table: is it in a run folder?") from error
+    if absent := [name for name in needed if name not in table]:
+        raise UserError(f"`{path}` lacks the columns {', '.join(absent)}: is it another table?")
+    return table
+
+
+def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
+    """Return run folders, each once, sorted; a pattern gives those with a config.yaml.
+
+    Raises:
+        UserError: if there is none, or one that is named does not exist.
+    """
+    found: dict[Path, Path] = {}
+    for text in [wanted] if isinstance(wanted, str) else wanted or []:
+        matches = [Path(path) for path in glob.glob(str(text), recursive=True)]
+        if glob.has_magic(str(text)):
+            matches = [path for path in matches if (path / "config.yaml").is_file()]
+        if not any(path.is_dir() for path in matches):
+            magic = glob.has_magic(str(text))
+            what = f"{text} matches none" if magic else f"there is no folder {text}"
+            raise UserError(f"`run` must name run folders, {what}.")
+        found |= {path.resolve(): path for path in sorted(matches)}
+    if not found:
+        raise UserError("`run` must name run folders: 'run=[runs/a,runs/b]' or 'run=runs/*'.")
+    return sorted(found.values())
+
+
+def read_runs(folders: Sequence[Path], *, rows: int = 100, unfinished: bool = False) -> Study:
+    """Read run folders.
+
+    Args:
+        folders: run folders.
+        rows: of a learning curve.
+        unfinished: whether runs that are not at their end are taken as they stand.
+
+    Returns:
+        Their tables. ``settings`` lists what differs between runs of one task, method and
+        corruption beside the seed: such runs are never averaged.
+
+    Raises:
+        UserError: if a folder can't be read, a run is not finished, or two are the same.
+    """
+    configs = [read_config(folder) for folder in folders]
+    curves = [
+        read_table(folder / "metrics.csv", ["frames", "return", "missing_ratio"])
+        for folder in folders
+    ]
+    evaluations = [_evaluations(*pair) for pair in zip(folders, configs, strict=True)]
+    runs = pd.DataFrame(map(_run, folders, configs, curves, evaluations))
+    late = runs[~runs.finished]
+    if len(late) and not (unfinished and runs.frames.all()):
+        first = late.sort_values("frames").iloc[0]
+        raise UserError(
+            f"`{first.run}` has {first.frames:,} of {first.total_frames:,} steps or lacks its "
+            "final evaluation: finish it with resume=<folder>, or pass unfinished=true (which "
+            "needs a rollout of each)."
+        )
+    _name_settings(runs, configs)
+    twins = runs[runs.duplicated(RUN, keep=False)].run.tolist()
+    if twins:
+        raise UserError(
+            f"`{twins[0]}` and `{twins[1]}` are the same task, method, settings and corruption "
+            "with the same seed: report them apart."
+        )
+    keys = [runs.loc[[i], RUN] for i in runs.index]
+    training = [k.merge(_thinned(c, rows), how="cross") for k, c in zip(keys, curves, strict=True)]
+    tested = [k.merge(e, how="cross") for k, e in zip(keys, evaluations, strict=True)]
+    return Study(
+        *(
+            pd.concat(tables).sort_values(RUN, kind="stable")
+            for tables in ([runs], training, tested)
+        )
+    )
+
+
+def _run(
+    folder: Path, config: Mapping[str, Any], curve: pd.DataFrame, tested: pd.DataFrame
+) -> dict[str, Any]:
+    frames = int(curve.frames.max()) if len(curve) else 0
+    task, noise = config["env"]["id"], config["noise"]
+    spikes = noise.get("spike_probability", 0)
+    corruption = missingness_point(config["missingness"])
+    early = curve[curve.frames <= WITHIN]
+    reached = early[
+        (early.get("episodes", 0) >= 100) & (early["return"] >= THRESHOLDS.get(task, np.inf))
+    ]
+    path = folder / "episodes.csv"
+    episodes = read_table(path, ["frames", "return"]) if path.is_file() else pd.DataFrame()
+    best = episodes[episodes.frames <= WITHIN]["return"].nlargest(10) if len(episodes) else []
+    path = folder / "versions.json"
+    versions = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    final = bool((tested.source == "final").any() or not config["evaluation"]["final_episodes"])
+    return {
+        "run": folder.name,
+        "task": f"{task}-{config['env']['version']}",
+        "method": method_name(config),
+        "settings": "",
+        "trained_on": corruption + (f" spikes:{spikes:g}:{noise['spike_std']:g}" if spikes else ""),
+        "noise_sigma": float(noise["sigma"]),
+        "seed": config["seed"],
+        "frames": frames,
+        "total_frames": config["total_frames"],
+        "finished": frames >= config["total_frames"] and final,
+        "return": curve["return"].iloc[-1] if len(curve) else None,
+        "missing_ratio": curve.missing_ratio.mean(),
+        "log_likelihood": _mean(curve, "log_likelihood", -max(1, len(curve) // 10)),
+        "steps_per_second": _speed(curve),
+        "top_10_return": np.mean(best) if len(best) == 10 else None,
+        "steps_to_threshold": reached.frames.min() if len(reached) else None,
+        **{name: versions.get(name) for name in _VERSIONS},
+    }
+
+
+def missingness_point(missingness: Mapping[str, Any]) -> str:
+    """Name what is missing as recipes/evaluate.py does: ``mcar:0.5``, ``outages:0.5:20:joint``."""
+    kind, eta = missingness["mechanism"], missingness.get("eta", 0)
+    if kind == "outages":
+        return f"outages:{eta:g}:{missingness['mean_length']:g}:{missingness['group_by']}"
+    return f"{kind}:{0 if kind == 'none' else eta:g}"
+
+
+def _evaluations(folder: Path, config: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the evaluations of the run itself, then those of recipes/evaluate.py."""
+    path = folder / "evaluation.csv"
+    needed = ["frames", "kind", "mode", "episodes", "return_mean"]
+    own = read_table(path, needed) if path.is_file() else pd.DataFrame(columns=needed)
+    own = own.rename(columns={"kind": "source"}).assign(
+        point=missingness_point(config["missingness"]), table=path.name
+    )
+    paths = [folder / name for name in EPISODE_TABLES if (folder / name).is_file()]
+    tables = [own, *(over_episodes(read_table(path, _EPISODE), path.name) for path in paths)]
+    rows = pd.concat([table for table in tables if len(table)] or tables)
+    return rows.reindex(columns=_EVALUATION).drop_duplicates(["source", "frames", "point", "mode"])
+
+
+_EVALUATION = [
+    *("source", "point", "frames", "mode", "episodes", "return_mean", "return_std"),
+    *("length_mean", "missing_ratio", "log_likelihood", "diverged", "table"),
+]
+_EPISODE = ["frames", "point", "mode", "return", "length", "missing_ratio"]
+
+
+def over_episodes(episodes: pd.DataFrame, table: str = "") -> pd.DataFrame:
+    """Sum up a table of recipes/evaluate.py over the episodes of a point and kind of action.
+
+    Args:
+        episodes: one row an episode, of one run.
+        table: its name.
+
+    Returns:
+        Rows as in evaluation.csv; missing ratio and log-likelihood over all steps and entries.
+    """
+    arrived = episodes.length * (1 - episodes.missing_ratio)
+    nats = arrived * episodes.get("log_likelihood", np.nan)
+    rows = (
+        episodes.assign(arrived=arrived, nats=nats, diverged=episodes.get("diverged", 0.0))
+        .groupby(["frames", "point", "mode"], sort=False, as_index=False)
+        .agg(
+            episodes=("return", "size"),
+            return_mean=("return", "mean"),
+            return_std=("return", "std"),
+            length_mean=("length", "mean"),
+            steps=("length", "sum"),
+            arrived=("arrived", "sum"),
+            nats=("nats", lambda values: values.sum(skipna=False)),
+            diverged=("diverged", "mean"),
+        )
+    )
+    return rows.assign(
+        source="points",
+        table=table,
+        missing_ratio=1 - rows.arrived / rows.steps,
+        log_likelihood=rows.nats / rows.arrived.clip(lower=1e-12),
+    ).drop(columns=["steps", "arrived", "nats"])
+
+
+def _thinned(curve: pd.DataFrame, rows: int) -> pd.DataFrame:
+    """Return a learning curve of at most ``rows`` rows; the return is a mean over 100 episodes."""
+    count = min(rows, len(curve))
+    sizes = np.diff(np.arange(count + 1) * len(curve) // count)
+    return pd.DataFrame(
+        {
+            "frames": int(part.frames.iloc[-1]),
+            "return": part["return"].iloc[-1],
+            "missing_ratio": part.missing_ratio.mean(),
+            "log_likelihood": _mean(part, "log_likelihood"),
+            "steps_per_second": _speed(part),
+        }
+        for _, part in curve.groupby(np.repeat(np.arange(count), sizes))
+    )
+
+
+def _mean(table: pd.DataFrame, column: str, start: int = 0) -> float:
+    return float(table[column].iloc[start:].mean()) if column in table else np.nan
+
+
+def _speed(curve: pd.DataFrame) -> float:
+    """Return frames over seconds; every row holds as many frames as the next."""
+    return 1 / (1 / curve.steps_per_second).mean() if "steps_per_second" in curve else np.nan
+
+
+def _name_settings(runs: pd.DataFrame, configs: Sequence[Mapping[str, Any]]) -> None:
+    """Fill ``settings`` (differing within a method) and ``overrides`` (within the study)."""
+    flat = pd.json_normalize(list(configs)).map(
+        lambda value: "null" if value is None else str(value)
+    )
+    flat = flat[[name for name in flat if name.split(".")[0] not in _NOT_COMPARED]]
+    for _, members in runs.groupby(["task", "method", "trained_on", "noise_sigma"]):
+        runs.loc[members.index, "settings"] = _differing(flat.loc[members.index])
+    shared = [n for n in flat if n.split(".")[0] not in ("env", "belief", "missingness", "noise")]
+    runs["overrides"] = _differing(flat[shared])
+
+
+def _differing(flat: pd.DataFrame) -> list[str]:
+    differing = flat[flat.columns[flat.nunique() > 1]].to_dict("records")
+    return [", ".join(f"{key}={value}" for key, value in row.items()) for row in differing]
