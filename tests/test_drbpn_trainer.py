@@ -99,7 +99,9 @@ def test_the_estimator_of_the_loss_is_gae_over_whole_sequences():
     with set_recurrent_mode(True):
         expected = gae(data.clone())["advantage"]
     loss.make_value_estimator(gamma=0.9, lmbda=0.8)
-    torch.testing.assert_close(loss.value_estimator(data.clone())["advantage"], expected)
+    for params in (None, loss.critic_network_params.detach()):
+        received = loss.value_estimator(data.clone(), params=params)["advantage"]
+        torch.testing.assert_close(received, expected)
 
 
 def test_networks_are_whole_and_their_parameters_are_the_losss():
