@@ -50,7 +50,10 @@ def run(config: dict[str, Any]) -> int:
     if not isinstance(config["rows"], int) or config["rows"] < 2:
         raise UserError(f"`rows` must be a whole number of at least 2, got {config['rows']!r}.")
     study = read_runs(
-        find_folders(config["run"]), rows=config["rows"], unfinished=config["unfinished"]
+        find_folders(config["run"]),
+        config["evaluation"],
+        rows=config["rows"],
+        unfinished=config["unfinished"],
     )
     out.mkdir(parents=True, exist_ok=True)
     study.write(out)

@@ -30,7 +30,7 @@ from training.methods import method_name, training_labels
 from training.run_folder import write_config
 
 ASKED = {"run": None, "out": None, "from": None, "title": None}
-ASKED |= {"reference": "drbpn", "rows": 100, "unfinished": False}
+ASKED |= {"evaluation": None, "reference": "drbpn", "rows": 100, "unfinished": False}
 FRAMES = [100, 200, 300, 400]
 STUDIES = sorted(path.parent for path in (ROOT / "results").glob("*/runs.csv"))
 WRITTEN = ("summary.csv", "aggregate.csv", "comparison.csv", "README.md")
@@ -219,6 +219,18 @@ def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path: Path
     report([folder], tmp_path / "out")
     assert row(tmp_path / "out", "mcar:0.5")["return"] == 85
     assert row(tmp_path / "out", "nmar:0.5")["return"] == 7
+
+
+def test_a_table_over_several_runs_is_read_by_their_names(
+    seeds: list[Path], tmp_path: Path
+) -> None:
+    tables = [
+        pd.DataFrame(episodes({"noise:3": (value,)})).assign(run=folder.name)
+        for value, folder in zip((1.0, 2.0, 6.0), seeds, strict=True)
+    ]
+    write_table(tmp_path / "robust.csv", pd.concat(tables))
+    report(seeds, tmp_path / "out", evaluation=str(tmp_path / "robust.csv"))
+    assert row(tmp_path / "out", "noise:3").per_seed == "0=1 1=2 2=6"
 
 
 def test_episodes_whose_belief_diverged_are_told(seeds: list[Path], tmp_path: Path) -> None:

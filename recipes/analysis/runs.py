@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import hmean
 from training.errors import UserError
 from training.methods import method_name
 from training.run_folder import read_config
@@ -32,6 +33,12 @@ THRESHOLDS = {
 }
 WITHIN = 2_000_000  # environment steps
 EPISODE_TABLES = ("robustness.csv", "points.csv")  # of recipes/evaluate.py, in order of precedence
+_CURVE = ["frames", "episodes", "return", "missing_ratio", "log_likelihood", "steps_per_second"]
+_EVALUATION = [
+    *("source", "point", "frames", "mode", "episodes", "return_mean", "return_std"),
+    *("length_mean", "missing_ratio", "log_likelihood", "diverged", "table"),
+]
+_EPISODE = ["frames", "point", "mode", "return", "length", "missing_ratio"]
 # Settings that change no number that is reported, or are columns of their own.
 _NOT_COMPARED = ("seed", "threads", "resume", "logger", "checkpoint", "evaluation", "method")
 _VERSIONS = ("torch", "torchrl", "gymnasium", "mujoco", "git_commit")
@@ -109,11 +116,18 @@ def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
     return sorted(found.values())
 
 
-def read_runs(folders: Sequence[Path], *, rows: int = 100, unfinished: bool = False) -> Study:
+def read_runs(
+    folders: Sequence[Path],
+    further: str | None = None,
+    *,
+    rows: int = 100,
+    unfinished: bool = False,
+) -> Study:
     """Read run folders.
 
     Args:
         folders: run folders.
+        further: table of recipes/evaluate.py over several runs.
         rows: of a learning curve.
         unfinished: whether runs that are not at their end are taken as they stand.
 
@@ -125,12 +139,11 @@ def read_runs(folders: Sequence[Path], *, rows: int = 100, unfinished: bool = Fa
         UserError: if a folder can't be read, a run is not finished, or two are the same.
     """
     configs = [read_config(folder) for folder in folders]
-    curves = [
-        read_table(folder / "metrics.csv", ["frames", "return", "missing_ratio"])
-        for folder in folders
-    ]
-    evaluations = [_evaluations(*pair) for pair in zip(folders, configs, strict=True)]
-    runs = pd.DataFrame(map(_run, folders, configs, curves, evaluations))
+    needed = ["frames", "return", "missing_ratio"]
+    curves = [read_table(f / "metrics.csv", needed).reindex(columns=_CURVE) for f in folders]
+    shared = read_table(Path(further), ["run", *_EPISODE]) if further else None
+    tested = [_evaluations(*pair, shared) for pair in zip(folders, configs, strict=True)]
+    runs = pd.DataFrame(map(_run, folders, configs, curves, tested))
     late = runs[~runs.finished]
     if len(late) and not (unfinished and runs.frames.all()):
         first = late.sort_values("frames").iloc[0]
@@ -147,14 +160,13 @@ def read_runs(folders: Sequence[Path], *, rows: int = 100, unfinished: bool = Fa
             "with the same seed: report them apart."
         )
     keys = [runs.loc[[i], RUN] for i in runs.index]
-    training = [k.merge(_thinned(c, rows), how="cross") for k, c in zip(keys, curves, strict=True)]
-    tested = [k.merge(e, how="cross") for k, e in zip(keys, evaluations, strict=True)]
-    return Study(
-        *(
-            pd.concat(tables).sort_values(RUN, kind="stable")
-            for tables in ([runs], training, tested)
+    thinned = [_thinned(curve, rows) for curve in curves]
+    tables = [runs]
+    for parts in (thinned, tested):
+        tables.append(
+            pd.concat(k.merge(part, how="cross") for k, part in zip(keys, parts, strict=True))
         )
-    )
+    return Study(*(table.sort_values(RUN, kind="stable") for table in tables))
 
 
 def _run(
@@ -164,13 +176,10 @@ def _run(
     task, noise = config["env"]["id"], config["noise"]
     spikes = noise.get("spike_probability", 0)
     corruption = missingness_point(config["missingness"])
-    early = curve[curve.frames <= WITHIN]
-    reached = early[
-        (early.get("episodes", 0) >= 100) & (early["return"] >= THRESHOLDS.get(task, np.inf))
-    ]
+    early = curve[(curve.frames <= WITHIN) & (curve.episodes >= 100)]
     path = folder / "episodes.csv"
-    episodes = read_table(path, ["frames", "return"]) if path.is_file() else pd.DataFrame()
-    best = episodes[episodes.frames <= WITHIN]["return"].nlargest(10) if len(episodes) else []
+    episodes = read_table(path, ["frames", "return"]) if path.is_file() else curve.head(0)
+    best = episodes[episodes.frames <= WITHIN]["return"].nlargest(10)
     path = folder / "versions.json"
     versions = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     final = bool((tested.source == "final").any() or not config["evaluation"]["final_episodes"])
@@ -187,10 +196,10 @@ def _run(
         "finished": frames >= config["total_frames"] and final,
         "return": curve["return"].iloc[-1] if len(curve) else None,
         "missing_ratio": curve.missing_ratio.mean(),
-        "log_likelihood": _mean(curve, "log_likelihood", -max(1, len(curve) // 10)),
-        "steps_per_second": _speed(curve),
-        "top_10_return": np.mean(best) if len(best) == 10 else None,
-        "steps_to_threshold": reached.frames.min() if len(reached) else None,
+        "log_likelihood": curve.log_likelihood.iloc[-max(1, len(curve) // 10) :].mean(),
+        "steps_per_second": hmean(curve.steps_per_second),  # every row holds as many frames
+        "top_10_return": best.mean() if len(best) == 10 else None,
+        "steps_to_threshold": early[early["return"] >= THRESHOLDS.get(task, np.inf)].frames.min(),
         **{name: versions.get(name) for name in _VERSIONS},
     }
 
@@ -203,25 +212,21 @@ def missingness_point(missingness: Mapping[str, Any]) -> str:
     return f"{kind}:{0 if kind == 'none' else eta:g}"
 
 
-def _evaluations(folder: Path, config: Mapping[str, Any]) -> pd.DataFrame:
+def _evaluations(
+    folder: Path, config: Mapping[str, Any], shared: pd.DataFrame | None
+) -> pd.DataFrame:
     """Return the evaluations of the run itself, then those of recipes/evaluate.py."""
     path = folder / "evaluation.csv"
     needed = ["frames", "kind", "mode", "episodes", "return_mean"]
     own = read_table(path, needed) if path.is_file() else pd.DataFrame(columns=needed)
-    own = own.rename(columns={"kind": "source"}).assign(
-        point=missingness_point(config["missingness"]), table=path.name
-    )
+    own = own.rename(columns={"kind": "source"})
+    tables = [own.assign(point=missingness_point(config["missingness"]), table=path.name)]
+    if shared is not None:
+        tables.append(over_episodes(shared[shared.run == folder.name], "over several runs"))
     paths = [folder / name for name in EPISODE_TABLES if (folder / name).is_file()]
-    tables = [own, *(over_episodes(read_table(path, _EPISODE), path.name) for path in paths)]
+    tables += [over_episodes(read_table(path, _EPISODE), path.name) for path in paths]
     rows = pd.concat([table for table in tables if len(table)] or tables)
     return rows.reindex(columns=_EVALUATION).drop_duplicates(["source", "frames", "point", "mode"])
-
-
-_EVALUATION = [
-    *("source", "point", "frames", "mode", "episodes", "return_mean", "return_std"),
-    *("length_mean", "missing_ratio", "log_likelihood", "diverged", "table"),
-]
-_EPISODE = ["frames", "point", "mode", "return", "length", "missing_ratio"]
 
 
 def over_episodes(episodes: pd.DataFrame, table: str = "") -> pd.DataFrame:
@@ -255,39 +260,23 @@ def over_episodes(episodes: pd.DataFrame, table: str = "") -> pd.DataFrame:
         table=table,
         missing_ratio=1 - rows.arrived / rows.steps,
         log_likelihood=rows.nats / rows.arrived.clip(lower=1e-12),
-    ).drop(columns=["steps", "arrived", "nats"])
+    )
 
 
 def _thinned(curve: pd.DataFrame, rows: int) -> pd.DataFrame:
     """Return a learning curve of at most ``rows`` rows; the return is a mean over 100 episodes."""
-    count = min(rows, len(curve))
-    sizes = np.diff(np.arange(count + 1) * len(curve) // count)
-    return pd.DataFrame(
-        {
-            "frames": int(part.frames.iloc[-1]),
-            "return": part["return"].iloc[-1],
-            "missing_ratio": part.missing_ratio.mean(),
-            "log_likelihood": _mean(part, "log_likelihood"),
-            "steps_per_second": _speed(part),
-        }
-        for _, part in curve.groupby(np.repeat(np.arange(count), sizes))
+    part = np.arange(len(curve)) * min(rows, len(curve)) // max(1, len(curve))
+    columns: dict[str, Any] = {"missing_ratio": "mean", "log_likelihood": "mean"}
+    columns |= {"steps_per_second": hmean}
+    means = curve.groupby(part).agg(columns)
+    return pd.concat(
+        [curve.groupby(part)[["frames", "return"]].nth(-1).reset_index(drop=True), means], axis=1
     )
-
-
-def _mean(table: pd.DataFrame, column: str, start: int = 0) -> float:
-    return float(table[column].iloc[start:].mean()) if column in table else np.nan
-
-
-def _speed(curve: pd.DataFrame) -> float:
-    """Return frames over seconds; every row holds as many frames as the next."""
-    return 1 / (1 / curve.steps_per_second).mean() if "steps_per_second" in curve else np.nan
 
 
 def _name_settings(runs: pd.DataFrame, configs: Sequence[Mapping[str, Any]]) -> None:
     """Fill ``settings`` (differing within a method) and ``overrides`` (within the study)."""
-    flat = pd.json_normalize(list(configs)).map(
-        lambda value: "null" if value is None else str(value)
-    )
+    flat = pd.json_normalize(list(configs)).map(lambda v: "null" if v is None else str(v))
     flat = flat[[name for name in flat if name.split(".")[0] not in _NOT_COMPARED]]
     for _, members in runs.groupby(["task", "method", "trained_on", "noise_sigma"]):
         runs.loc[members.index, "settings"] = _differing(flat.loc[members.index])
