@@ -19,7 +19,7 @@ from torchrl.collectors import Collector
 from torchrl.data import Binary
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 
-from torchrl_drbpn.functional.corruption import outage_rates, sample_working
+from torchrl_drbpn.functional.missingness import outage_rates, sample_working
 from torchrl_drbpn.transforms import ObservationMissingness, SensorOutages, seed_env
 
 COMPLETE = "complete_observation"

@@ -31,7 +31,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from torchrl_drbpn.functional.corruption import missing_probability, sample_observed
+from torchrl_drbpn.functional.missingness import missing_probability, sample_mask
 from torchrl_drbpn.transforms import (
     ObservationMissingness,
     ObservationNoise,
@@ -113,7 +113,7 @@ def test_masks_follow_the_law_with_the_action_that_led_there(mechanism):
 
     def draw(complete, action):
         probability = missing_probability(parameters, complete, action, 0.8)
-        return sample_observed(probability, complete, generator)
+        return sample_mask(probability, complete, generator)
 
     assert torch.equal(rollout["observed"][:, 0], draw(rollout[COMPLETE][:, 0], None))
     for t in range(9):

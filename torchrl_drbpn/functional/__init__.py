@@ -8,18 +8,6 @@ from torchrl_drbpn.functional.calibration import (
     nis,
 )
 from torchrl_drbpn.functional.compiled import native_error
-from torchrl_drbpn.functional.corruption import (
-    MissingnessMechanism,
-    OutageRates,
-    count_always_observed,
-    draw_mechanism,
-    missing_probability,
-    outage_rates,
-    sample_noise,
-    sample_observed,
-    sample_spikes,
-    sample_working,
-)
 from torchrl_drbpn.functional.filtering import (
     FilterOutput,
     FollowedOutput,
@@ -39,6 +27,18 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
+from torchrl_drbpn.functional.missingness import (
+    MissingnessMechanism,
+    OutageRates,
+    count_always_observed,
+    draw_mechanism,
+    missing_probability,
+    outage_rates,
+    sample_mask,
+    sample_noise,
+    sample_spikes,
+    sample_working,
+)
 from torchrl_drbpn.functional.model import Following, StateSpace, choose_form, predict_step
 from torchrl_drbpn.functional.particles import (
     DiagonalGaussian,
@@ -105,8 +105,8 @@ __all__ = [
     "predict",
     "predict_step",
     "resample",
+    "sample_mask",
     "sample_noise",
-    "sample_observed",
     "sample_spikes",
     "sample_working",
     "saturate_innovation",

@@ -1,18 +1,17 @@
 """What happens to observations between the simulator and the agent."""
 
-from torchrl_drbpn.transforms.filling import FillLastObserved
+from torchrl_drbpn.transforms.forward_fill import FillLastObserved
 from torchrl_drbpn.transforms.missingness import (
     ObservationMissingness,
     ObservedFromNaN,
     SensorReduction,
 )
-from torchrl_drbpn.transforms.noise import ObservationNoise
+from torchrl_drbpn.transforms.noise import ObservationNoise, ObservationSpikes
 from torchrl_drbpn.transforms.normalisation import MaskedObservationNorm
 from torchrl_drbpn.transforms.outages import SensorOutages
 from torchrl_drbpn.transforms.previous_action import PreviousAction
 from torchrl_drbpn.transforms.return_scale import RunningReturnScale
 from torchrl_drbpn.transforms.seeding import seed_env
-from torchrl_drbpn.transforms.spikes import ObservationSpikes
 
 __all__ = [
     "FillLastObserved",

@@ -7,29 +7,24 @@ from numbers import Real
 from typing import ClassVar
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
-from torchrl_drbpn.functional.arrivals import sample_arrivals
-from torchrl_drbpn.functional.corruption import (
+from torchrl_drbpn.functional.gaussian import zero_missing
+from torchrl_drbpn.functional.missingness import (
     MissingnessKind,
     MissingnessMechanism,
     draw_mechanism,
+    missing_probability,
+    sample_mask,
 )
-from torchrl_drbpn.functional.gaussian import zero_missing
-from torchrl_drbpn.transforms._common import Role, as_key_list, fetch
-from torchrl_drbpn.transforms._corrupting import (
-    CorruptingTransform,
-    SeededTransform,
-    check_seed,
-)
+from torchrl_drbpn.transforms._base import CorruptingTransform, Keys, Role, Step, as_key_list, read
+from torchrl_drbpn.transforms.seeding import SeededTransform, check_seed
 
 _KINDS = ("mcar", "mar", "nmar")
 
 
-class ObservationMissingness(SeededTransform, CorruptingTransform):
+class ObservationMissingness(SeededTransform):
     r"""Let entries of the observation go missing, at every step and at every reset.
 
     Second half of Eq. (2) [DRBPN]. With a_{t-1} the action that led to the observation x (zero at
@@ -46,19 +41,17 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
     `seed_env`. MAR and NMAR realise clearly less than $\eta$: report the realised ratio as well.
 
     Missing entries become 0, NaN and inf beneath included, and False in the mask, which is ANDed
-    into one that is there already. One seed gives one sequence of masks. The workers of a batched
-    environment that are built by one function share a seed and so their masks, until `seed_env`
-    gives each its own. Several observation keys count as one vector. Two of them in one environment
-    need different seeds, or they lose the same entries.
+    into one that is there already. Several observation keys count as one vector.
 
     Args:
         mechanism: "mcar", "mar" or "nmar".
         eta: missing rate (mcar) or its upper bound (mar, nmar), in [0, 1].
 
     Keyword Args:
-        always_observed: share of the components that always arrive (mar, nmar), in [0, 1].
+        always_observed: share of the components that always arrive (mar, nmar), in [0, 1).
         mechanism_seed: seed of the mechanism's parameters, not negative.
-        seed: seed of the masks, not negative.
+        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
+            which gives the same masks to every worker and every transform that is built with it.
         in_keys: observation keys, each of shape `(*batch, obs)`.
         mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
         complete_key: key (or one key per observation) under which the observation is recorded
@@ -66,7 +59,7 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
         action_key: the action (mar, nmar), shape `(*batch, action)`, of the environment itself.
 
     Raises:
-        ValueError: if an argument lies outside its range.
+        ValueError: if an argument lies outside its range, or no component could go missing.
 
     Example:
         >>> import torch
@@ -78,7 +71,7 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
         >>> bool((data["observed"].float().mean() - 0.5).abs() < 0.02)
         True
 
-    See also: `torchrl_drbpn.functional.missing_probability`, `sample_observed`.
+    See also: `torchrl_drbpn.functional.missing_probability`, `sample_mask`.
     """
 
     role: ClassVar[Role] = "missingness"
@@ -92,10 +85,10 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
         *,
         always_observed: float = 0.25,
         mechanism_seed: int = 0,
-        seed: int = 0,
-        in_keys: NestedKey | Sequence[NestedKey] = ("observation",),
-        mask_keys: NestedKey | Sequence[NestedKey] | None = None,
-        complete_key: NestedKey | Sequence[NestedKey] | None = None,
+        seed: int | None = None,
+        in_keys: Keys = ("observation",),
+        mask_keys: Keys | None = None,
+        complete_key: Keys | None = None,
         action_key: NestedKey = "action",
     ) -> None:
         super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
@@ -103,13 +96,18 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
             raise ValueError(f"`mechanism` must be one of {_KINDS}, got {mechanism!r}.")
         if not 0.0 <= always_observed <= 1.0:
             raise ValueError(f"`always_observed` must be a share in [0, 1], got {always_observed}.")
+        if mechanism != "mcar" and always_observed == 1.0:
+            raise ValueError(
+                "`always_observed` must leave components that can go missing, got 1.0, with which "
+                "nothing is ever missing. Pass a smaller share, or eta=0.0 for complete data."
+            )
         self.mechanism = mechanism
         self.eta = eta
         self.always_observed = always_observed
         self.mechanism_seed = check_seed(mechanism_seed, "mechanism_seed")
         (self.action_key,) = as_key_list(action_key)
-        self._parameters_drawn: MissingnessMechanism | None = None
-        self._parameters_cast: MissingnessMechanism | None = None
+        self._drawn: MissingnessMechanism | None = None
+        self._cast: MissingnessMechanism | None = None
 
     @property
     def eta(self) -> float:
@@ -118,130 +116,73 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
 
     @eta.setter
     def eta(self, eta: float) -> None:
-        if not isinstance(eta, Real) or not 0.0 <= eta <= 1.0:
+        if isinstance(eta, bool) or not isinstance(eta, Real) or not 0.0 <= eta <= 1.0:
             raise ValueError(f"`eta` must be a missing rate in [0, 1], got {eta!r}.")
         self._eta = float(eta)
 
     @property
     def mechanism_parameters(self) -> MissingnessMechanism | None:
-        """Always observed components and b0, b1, b2; None under "mcar" or before the first use."""
-        return self._parameters_drawn
+        """Always observed components and b0, b1, b2; None under "mcar" or before the first step."""
+        return self._drawn
 
-    # ------------------------------------------------------------------------------- on tensors
-    def _corrupt(
-        self,
-        observation: Tensor,
-        observed: Tensor | None,
-        root: TensorDictBase | None,
-        following: TensorDictBase,
-    ) -> tuple[Tensor, Tensor | None]:
-        del following
-        action = parameters = None
-        if self.mechanism != "mcar":
-            action = None if root is None else self._action(root, observation)
-            parameters = self._parameters_for(observation, action)
-        return sample_arrivals(
-            parameters,
-            observation,
-            observed,
-            action,
-            self._eta,
-            self.generator(observation.device),
-        )
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+        x, generator = step.observation, self.generator(step.observation.device)
+        if self.mechanism == "mcar":
+            return x, sample_mask(self._eta, x, generator)
+        action = None if step.before is None else self._action(step.before, x)
+        parameters = self._mechanism_for(x, action)
+        # what an earlier transform hides enters no law
+        seen = x if step.observed is None else zero_missing(x, step.observed)
+        law = missing_probability(parameters, seen, action, self._eta)
+        return x, sample_mask(law, x, generator)
 
     def _action(self, root: TensorDictBase, observation: Tensor) -> Tensor:
-        action = fetch(root, self.action_key)
-        if action is None:
-            raise KeyError(
-                f"`{type(self).__name__}` with mechanism {self.mechanism!r} reads the action under "
-                f"{self.action_key!r}, which is not there. Pass action_key=... ."
-            )
+        action = read(root, self.action_key, self)
         if action.shape[:-1] != observation.shape[:-1] or action.ndim == 0:
             raise ValueError(
                 f"`{self.action_key}` must be a vector of shape (*batch, action) with batch "
                 f"{tuple(observation.shape[:-1])}, got {tuple(action.shape)}. Mechanism "
-                f'{self.mechanism!r} weighs its components; use "mcar" for other actions.'
+                f'{self.mechanism!r} weighs its components; use one-hot actions or "mcar".'
             )
-        same = action.dtype is observation.dtype
-        cast: Tensor = action if same else action.to(observation.dtype)
-        return cast
+        return action.to(observation.dtype)
 
-    # ------------------------------------------------------------------ the mechanism's parameters
-    def _parameters_for(self, observation: Tensor, action: Tensor | None) -> MissingnessMechanism:
-        cast = self._parameters_cast
-        if (
-            cast is not None
-            and cast.bias.dtype is observation.dtype
-            and cast.bias.device == observation.device
-        ):
-            self._check_dimensions(cast, observation, action)
-            return cast
-        drawn = self._parameters_drawn
+    def _mechanism_for(self, observation: Tensor, action: Tensor | None) -> MissingnessMechanism:
+        """Return the mechanism in the dtype and on the device of the observation."""
+        drawn = self._drawn
         if drawn is None:
-            action_dim = self._action_dim() if action is None else action.shape[-1]
             drawn = draw_mechanism(
                 "mar" if self.mechanism == "mar" else "nmar",
                 observation.shape[-1],
-                0 if action_dim is None else action_dim,
+                0 if action is None else action.shape[-1],
                 always_observed=self.always_observed,
                 generator=torch.Generator().manual_seed(self.mechanism_seed),
             )
-            if action_dim is not None:
-                self._parameters_drawn = drawn
-        self._check_dimensions(drawn, observation, action)
-        cast = MissingnessMechanism(
-            drawn.always_observed.to(observation.device),
-            *(part.to(observation) for part in drawn[1:]),
-        )
-        if self._parameters_drawn is not None:
-            self._parameters_cast = cast
-        return cast
-
-    def _check_dimensions(
-        self, parameters: MissingnessMechanism, observation: Tensor, action: Tensor | None
-    ) -> None:
-        obs_dim, action_dim = parameters.action_weight.shape
-        if observation.shape[-1] != obs_dim or (
-            action is not None and action.shape[-1] != action_dim
-        ):
-            received = None if action is None else action.shape[-1]
+            # the first reset does not know the action, whose weights are drawn last
+            self._drawn = None if action is None else drawn
+        obs_dim, action_dim = drawn.action_weight.shape
+        received = observation.shape[-1], action_dim if action is None else action.shape[-1]
+        if received != (obs_dim, action_dim):
             raise ValueError(
                 f"`{self.in_keys}` must have {obs_dim} components and `{self.action_key}` "
-                f"{action_dim}, for which the mechanism was drawn or loaded, got "
-                f"{observation.shape[-1]} and {received}. Is the state of another environment?"
+                f"{action_dim}, for which the mechanism was drawn or loaded, got {received[0]} and "
+                f"{received[1]}. Is the state of another environment?"
             )
-
-    def _action_dim(self) -> int | None:
-        # the action that reaches the innermost environment is the one found at the root in `_step`:
-        # the inverse transforms have all been applied by then
-        env = self.container
-        if env is None:
-            return None
-        while isinstance(env, TransformedEnv):
-            env = env.base_env
-        spec = env.full_action_spec
-        if self.action_key not in spec.keys(True, True):
-            raise KeyError(
-                f"`{type(self).__name__}` with mechanism {self.mechanism!r} reads the action under "
-                f"{self.action_key!r}, which is not among the actions "
-                f"{sorted(map(str, spec.keys(True, True)))}. Pass action_key=... ."
-            )
-        leaf, key = spec[self.action_key], self.action_key
-        parent = spec[key[:-1]] if isinstance(key, tuple) else spec
-        if len(leaf.shape) - len(parent.shape) != 1:
-            raise ValueError(
-                f"`{key}` must be a vector of shape (*batch, action) for mechanism "
-                f"{self.mechanism!r}, got shape {tuple(leaf.shape)} with batch "
-                f'{tuple(parent.shape)}. Use one-hot actions or "mcar".'
-            )
-        return int(leaf.shape[-1])
+        cast = self._cast
+        if cast is None or (cast.bias.dtype, cast.bias.device) != (
+            observation.dtype,
+            observation.device,
+        ):
+            always = drawn.always_observed.to(observation.device)
+            cast = MissingnessMechanism(always, *(part.to(observation) for part in drawn[1:]))
+            self._cast = None if self._drawn is None else cast
+        return cast
 
     # -------------------------------------------------------------------------------------- state
     def get_extra_state(self) -> dict[str, Tensor]:
         """Return seed, generator state and the mechanism's parameters as tensors."""
         state = super().get_extra_state()
-        if self._parameters_drawn is not None:
-            state |= {f"mechanism.{k}": v for k, v in self._parameters_drawn._asdict().items()}
+        if self._drawn is not None:
+            state |= {f"mechanism.{k}": v for k, v in self._drawn._asdict().items()}
             state["mechanism.kind"] = torch.tensor(_KINDS.index(self.mechanism))
             state["mechanism.seed"] = torch.tensor(self.mechanism_seed)
         return state
@@ -258,28 +199,25 @@ class ObservationMissingness(SeededTransform, CorruptingTransform):
         Raises:
             ValueError: the state is that of the same mechanism with another `mechanism_seed`.
         """
-        kind = state.get("mechanism.kind")
-        same = kind is not None and _KINDS[int(kind)] == self.mechanism
-        drawn_by = state.get("mechanism.seed")
-        if same and drawn_by is not None and int(drawn_by) != self.mechanism_seed:
+        same = _KINDS.index(self.mechanism) == int(state.get("mechanism.kind", -1))
+        drawn_by = int(state.get("mechanism.seed", self.mechanism_seed))
+        if same and drawn_by != self.mechanism_seed:
             raise ValueError(
-                f"the state is that of mechanism_seed {int(drawn_by)}, this transform has "
+                f"the state is that of mechanism_seed {drawn_by}, this transform has "
                 f"mechanism_seed {self.mechanism_seed}: they lose other sensors. Build it with "
-                "that seed, or load the state of the normaliser alone."
+                f"mechanism_seed={drawn_by}."
             )
         super().set_extra_state(state)
         if same:
-            self._parameters_drawn = MissingnessMechanism(
-                *(state[f"mechanism.{name}"].cpu() for name in MissingnessMechanism._fields)
-            )
-            self._parameters_cast = None
+            parts = (state[f"mechanism.{name}"].cpu() for name in MissingnessMechanism._fields)
+            self._drawn, self._cast = MissingnessMechanism(*parts), None
 
 
 class SensorReduction(CorruptingTransform):
     """Take sensors away for good: the named components never arrive.
 
-    Nothing is drawn, so that it may stand in an environment as well as on a replay buffer, for
-    which in_keys should then name the next observations too.
+    Nothing is drawn, so that it may stand in an environment as well as on a replay buffer: with
+    `in_keys=["observation", ("next", "observation")]` both lose the same sensors.
 
     Args:
         missing: the components without a sensor; indices (negative ones count from the end), or
@@ -313,63 +251,49 @@ class SensorReduction(CorruptingTransform):
         self,
         missing: Sequence[int] | Sequence[bool] | Tensor,
         *,
-        in_keys: NestedKey | Sequence[NestedKey] = ("observation",),
-        mask_keys: NestedKey | Sequence[NestedKey] | None = None,
-        complete_key: NestedKey | Sequence[NestedKey] | None = None,
+        in_keys: Keys = ("observation",),
+        mask_keys: Keys | None = None,
+        complete_key: Keys | None = None,
     ) -> None:
         super().__init__(in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
-        tensor = torch.as_tensor(missing)
+        tensor = torch.as_tensor(missing).cpu()
         if tensor.numel() == 0 and tensor.dtype != torch.bool:
             tensor = tensor.to(torch.int64).reshape(-1)
-        is_bool = tensor.dtype == torch.bool
-        if (
-            tensor.ndim == 0
-            or (tensor.ndim > 1 and not is_bool)
-            or tensor.is_floating_point()
-            or tensor.is_complex()
-        ):
+        whole = not (tensor.is_floating_point() or tensor.is_complex())
+        if not whole or tensor.ndim == 0 or (tensor.ndim > 1 and tensor.dtype != torch.bool):
             raise ValueError(
                 "`missing` must be a list of indices, or bool of shape (obs,) or (*batch, obs), "
                 f"True where there is no sensor, got {missing!r}."
             )
-        self.missing = tensor.cpu()
+        self.missing = tensor
         self._present: Tensor | None = None
 
     def _check_obs_dim(self, obs_dim: int) -> None:
-        missing = self.missing
+        missing, where = self.missing, f"for in_keys {self.in_keys} with {obs_dim} components"
         if missing.dtype == torch.bool:
             if missing.shape[-1] != obs_dim:
                 raise ValueError(
-                    f"`missing` as bool must have one entry per component, {obs_dim}, for in_keys "
-                    f"{self.in_keys}, got {missing.shape[-1]}."
+                    f"`missing` as bool must have one entry per component {where}, got "
+                    f"{missing.shape[-1]}."
                 )
         elif bool(((missing < -obs_dim) | (missing >= obs_dim)).any()):
             raise ValueError(
-                f"`missing` must hold indices from {-obs_dim} to {obs_dim - 1} for in_keys "
-                f"{self.in_keys} with {obs_dim} components, got {missing.tolist()}."
+                f"`missing` must hold indices from {-obs_dim} to {obs_dim - 1} {where}, got "
+                f"{missing.tolist()}."
             )
 
-    def _corrupt(
-        self,
-        observation: Tensor,
-        observed: Tensor | None,
-        root: TensorDictBase | None,
-        following: TensorDictBase,
-    ) -> tuple[Tensor, Tensor | None]:
-        del root, following
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+        observation = step.observation
+        obs_dim, device = observation.shape[-1], observation.device
         present = self._present
-        if (
-            present is None
-            or present.shape[-1] != observation.shape[-1]
-            or present.device != observation.device
-        ):
-            self._check_obs_dim(observation.shape[-1])
+        if present is None or present.shape[-1] != obs_dim or present.device != device:
+            self._check_obs_dim(obs_dim)
             if self.missing.dtype == torch.bool:
                 present = ~self.missing
             else:
-                present = torch.ones(observation.shape[-1], dtype=torch.bool)
+                present = torch.ones(obs_dim, dtype=torch.bool)
                 present[self.missing] = False
-            present = self._present = present.to(observation.device)
+            present = self._present = present.to(device)
         if present.ndim > 1 and present.shape != observation.shape:
             # never broadcast: rows that were meant for other environments would go unnoticed
             raise ValueError(
@@ -377,18 +301,16 @@ class SensorReduction(CorruptingTransform):
                 f"(*batch, obs) = {tuple(observation.shape)}, got {tuple(present.shape)}. One "
                 "choice for all rows has the shape (obs,)."
             )
-        arrived = present.expand(observation.shape)
-        # a copy of its own in both cases: what is expanded shares memory between rows
-        arrived = arrived.clone() if observed is None else arrived & observed
-        return zero_missing(observation, arrived), arrived
+        # a tensor of its own: what is expanded shares memory between rows
+        return observation, present.expand(observation.shape).clone()
 
 
 class ObservedFromNaN(CorruptingTransform):
     """Read NaN as "did not arrive": NaN becomes 0 and False in the mask.
 
-    The way in for real sensors that fail. Where the environment writes a mask of its own under the
-    mask key, an entry counts as observed if that mask is True and the value is not NaN. Infinite
-    values are left: they are errors, not gaps.
+    The way in for real sensors that fail, in an environment or on a replay buffer. Where there is a
+    mask already, an entry counts as observed if that mask is True and the value is not NaN.
+    Infinite values are left: they are errors, not gaps.
 
     Keyword Args:
         in_keys: observation keys, each of shape `(*batch, obs)`.
@@ -405,23 +327,8 @@ class ObservedFromNaN(CorruptingTransform):
 
     role: ClassVar[Role] = "from_nan"
 
-    def __init__(
-        self,
-        *,
-        in_keys: NestedKey | Sequence[NestedKey] = ("observation",),
-        mask_keys: NestedKey | Sequence[NestedKey] | None = None,
-    ) -> None:
+    def __init__(self, *, in_keys: Keys = ("observation",), mask_keys: Keys | None = None) -> None:
         super().__init__(in_keys=in_keys, mask_keys=mask_keys)
 
-    def _corrupt(
-        self,
-        observation: Tensor,
-        observed: Tensor | None,
-        root: TensorDictBase | None,
-        following: TensorDictBase,
-    ) -> tuple[Tensor, Tensor | None]:
-        del root, following
-        arrived = observation == observation  # NaN alone differs from itself
-        if observed is not None:
-            arrived = arrived & observed
-        return zero_missing(observation, arrived), arrived
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+        return step.observation, ~step.observation.isnan()

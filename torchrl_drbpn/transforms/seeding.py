@@ -1,30 +1,174 @@
-"""Seed an environment together with its transforms, in worker processes too."""
+"""Where the random transforms take their numbers from, and how a whole environment is seeded."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
-from typing import Any
+import multiprocessing
+import os
+import warnings
+import zlib
+from numbers import Integral
+from typing import Any, ClassVar
 
 import torch
-from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, Transform, TransformedEnv
+from torch import Tensor
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
-from torchrl_drbpn.transforms._corrupting import SeededTransform, check_seed
+from torchrl_drbpn.transforms._base import CorruptingTransform, EnvironmentTransform
 
+_SEED_BITS = 63
 _EXTRA = "_extra_state"
 
 
-def seed_env(env: EnvBase, seed: int) -> int | None:
-    """Seed `env` and every transform that owns a generator, with a seed of its own for each.
+def check_seed(seed: int, name: str = "seed") -> int:
+    """Return `seed` after checking that it is an integer in [0, 2**63)."""
+    if isinstance(seed, bool) or not isinstance(seed, Integral):
+        raise TypeError(f"`{name}` must be an integer, got {seed!r} of type {type(seed).__name__}.")
+    if not 0 <= seed < 1 << _SEED_BITS:
+        raise ValueError(f"`{name}` must lie in [0, 2**{_SEED_BITS}), got {seed}.")
+    return int(seed)
 
-    TorchRL's `env.set_seed` reaches the simulator alone. This reaches the transforms of
-    `TransformedEnv`s too, nested ones included, and those inside the workers of `SerialEnv` and
-    `ParallelEnv`, so that no two workers see the same noise and a seed reproduces everything. The
+
+# ---------------------------------------------------------------------------- worker processes
+# The seed of torch's global generator as this process inherited it; None where it has its own. A
+# forked process starts with a copy of its parent's generator, so that siblings draw the same
+# numbers; in a child that imports this module late nobody can tell, and it is treated as forked.
+_inherited: int | None = torch.initial_seed() if multiprocessing.parent_process() else None
+
+
+def _note_fork() -> None:
+    global _inherited
+    _inherited = torch.initial_seed()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
+
+
+def _separate_worker() -> None:
+    """Move the inherited global generator on by the name of the process, once.
+
+    `torch.manual_seed` in the process, as by `ParallelEnv.set_seed`, has the last word: before this
+    it makes it superfluous, after this it undoes it.
+    """
+    global _inherited
+    if _inherited is not None and torch.initial_seed() == _inherited:
+        name = multiprocessing.current_process().name.encode()
+        torch.manual_seed(int(torch.randint(1 << _SEED_BITS - 1, ())) ^ zlib.crc32(name))
+    _inherited = None
+
+
+# ------------------------------------------------------------------------------------ transform
+class SeededTransform(EnvironmentTransform, CorruptingTransform):
+    """A corrupting transform that draws.
+
+    With a seed it has a generator of its own, made on the device of the data: the global one is
+    neither read nor advanced, equal seeds give equal sequences, two classes with the same seed
+    unrelated ones, and the state of the generator is part of `state_dict`. Without one it draws
+    from torch's global generator, which `torch.manual_seed` seeds, and `env.set_seed` in the
+    workers of a `ParallelEnv`.
+
+    Args:
+        seed: seed of the generator, not negative, or None.
+        **keys: passed on to `CorruptingTransform`.
+    """
+
+    why_online = "draws afresh at every call"
+    # separates the random streams of the classes: noise and missingness with the same seed must not
+    # be built from the same uniform numbers
+    stream: ClassVar[int]
+
+    def __init__(self, *, seed: int | None, **keys: Any) -> None:
+        super().__init__(**keys)
+        self.set_seed(seed)
+        if seed is None:
+            _separate_worker()
+
+    def set_seed(self, seed: int | None) -> None:
+        """Start the random sequence of `seed` from its beginning.
+
+        Args:
+            seed: the new seed, not negative; None for torch's global generator.
+        """
+        self.seed = None if seed is None else check_seed(seed)
+        self._generator: torch.Generator | None = None
+        self._saved_state: Tensor | None = None
+
+    def generator(self, device: torch.device) -> torch.Generator | None:
+        """Return what to draw from on `device`; None is torch's global generator.
+
+        Args:
+            device: where random numbers are needed.
+
+        Returns:
+            The generator; drawing from it advances the transform's sequence.
+        """
+        if self.seed is None or device.type == "meta":
+            _separate_worker()
+            return None
+        generator = self._generator
+        if generator is None or generator.device != device:
+            generator = self._generator = torch.Generator(device=device)
+            # golden-ratio steps spread neighbouring seeds, `stream` separates the classes
+            mixed = self.seed * 0x9E3779B97F4A7C15 + self.stream * 0xD1B54A32D192ED03
+            generator.manual_seed(mixed % (1 << _SEED_BITS))
+            if self._saved_state is not None:
+                self._restore(generator, self._saved_state)
+                self._saved_state = None
+        return generator
+
+    @staticmethod
+    def _restore(generator: torch.Generator, state: Tensor) -> None:
+        size = generator.get_state().numel()
+        if state.numel() != size:
+            warnings.warn(
+                f"the saved generator state has {state.numel()} bytes, one on {generator.device} "
+                f"has {size}: it was saved on another kind of device and can't be continued here. "
+                "The sequence starts again from its seed.",
+                stacklevel=3,
+            )
+            return
+        generator.set_state(state)
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return seed (-1 for None) and generator state as tensors, for `state_dict`."""
+        state = torch.empty(0, dtype=torch.uint8)
+        if self._generator is not None:
+            state = self._generator.get_state()
+        elif self._saved_state is not None:
+            state = self._saved_state
+        seed = -1 if self.seed is None else self.seed
+        return {"seed": torch.tensor(seed), "generator": state.clone()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Continue from what `get_extra_state` returned.
+
+        Args:
+            state: seed and generator state.
+        """
+        seed, saved = int(state["seed"]), state["generator"].cpu()
+        self.set_seed(None if seed < 0 else seed)
+        self._saved_state = saved.clone() if saved.numel() else None
+
+    def clone(self) -> Any:
+        """Return a copy without a parent, whose generator runs on by itself from the same state."""
+        copy = super().clone()
+        if self._generator is not None:
+            copy._generator = self._generator.clone_state()
+        return copy
+
+
+# ----------------------------------------------------------------------------------- environment
+def seed_env(env: EnvBase, seed: int) -> int | None:
+    """Seed `env` and every transform that draws, with a seed of its own for each.
+
+    TorchRL's `env.set_seed` reaches the simulator, and torch's global generator in the workers of a
+    `ParallelEnv`. This also gives every transform that draws a generator of its own, in
+    `TransformedEnv`s within each other and in the workers of `SerialEnv` and `ParallelEnv`, so that
+    no two workers see the same noise and a seed reproduces everything, whatever else draws. The
     `mechanism_seed` of a mechanism stays what it is.
 
-    A batched environment inside the worker process of a `ParallelEnv` is not reached, nor are the
-    environments of collectors that run in processes of their own: seed those in the function that
-    builds them.
+    Not reached: environments wrapped twice or batched inside a worker, and those of collectors that
+    run in processes of their own: seed those in the function that builds them.
 
     Args:
         env: the environment; batched ones are started.
@@ -50,49 +194,36 @@ def seed_env(env: EnvBase, seed: int) -> int | None:
     seed = check_seed(seed)
     next_seed: int | None = env.set_seed(seed)
     source = torch.Generator().manual_seed(seed)
-    for set_seed in _seed_setters(env):
-        set_seed(int(torch.randint(2**62, (), generator=source)))
+
+    def draw() -> int:
+        return int(torch.randint(2**62, (), generator=source))
+
+    while isinstance(env, TransformedEnv):
+        for transform in env.transform.modules():
+            if isinstance(transform, SeededTransform):
+                transform.set_seed(draw())
+        env = env.base_env
+    if isinstance(env, SerialEnv | ParallelEnv):
+        # what a worker reports of its state names the generators in it
+        states = env.state_dict()
+        for index in range(env.num_workers):
+            state = states[f"worker{index}"]
+            for key, value in state.items():
+                *path, last = key.split(".")
+                if last != _EXTRA or not isinstance(value, dict) or "generator" not in value:
+                    continue
+                if isinstance(env, ParallelEnv):
+                    _call_in_worker(env, index, path, draw())
+                else:
+                    value |= {"seed": torch.tensor(draw()), "generator": value["generator"][:0]}
+        if isinstance(env, SerialEnv):
+            env.load_state_dict(states)
     return next_seed
 
 
-def _seed_setters(env: EnvBase) -> Iterator[Callable[[int], Any]]:
-    """Yield `set_seed` of every transform in `env` that has a generator, in a fixed order."""
-    while isinstance(env, TransformedEnv):
-        yield from _in_transform(env.transform)
-        env = env.base_env
-    if isinstance(env, ParallelEnv):
-        states = env.state_dict()
-        for index in range(env.num_workers):
-            yield from _in_worker(env, index, states[f"worker{index}"])
-    elif isinstance(env, SerialEnv):
-        for worker in env._envs:
-            yield from _seed_setters(worker)
-
-
-def _in_transform(transform: Transform) -> Iterator[Callable[[int], Any]]:
-    if isinstance(transform, Compose):
-        for part in transform.transforms:
-            yield from _in_transform(part)
-    elif isinstance(transform, SeededTransform):
-        yield transform.set_seed
-
-
-def _in_worker(
-    env: ParallelEnv, index: int, state: dict[str, Any]
-) -> Iterator[Callable[[int], Any]]:
-    """Yield setters that act inside a worker process.
-
-    The state that a worker reports names the place of each generator, as in
-    `transforms.1._extra_state`; a chain of attributes asked of a `ParallelEnv` is looked up in its
-    workers, and one of its entries is a view on that worker alone.
-    """
-    for key, value in state.items():
-        *path, last = key.split(".")
-        if last == _EXTRA and isinstance(value, dict) and {"seed", "generator"} <= value.keys():
-            yield partial(_call_in_worker, env, index, path)
-
-
 def _call_in_worker(env: ParallelEnv, index: int, path: list[str], seed: int) -> None:
+    # A chain of attributes asked of a ParallelEnv is looked up in its workers. Its load_state_dict
+    # would do, but leaves a signal behind that the next step takes for its own.
     target: Any = env[index].transform
     for name in [*path, "set_seed"]:
         target = getattr(target, name)

@@ -16,13 +16,13 @@ import math
 import pytest
 import torch
 
-from torchrl_drbpn.functional.corruption import (
+from torchrl_drbpn.functional.missingness import (
     count_always_observed,
     draw_mechanism,
     missing_probability,
     outage_rates,
+    sample_mask,
     sample_noise,
-    sample_observed,
     sample_spikes,
     sample_working,
 )
@@ -141,7 +141,7 @@ def test_only_nmar_depends_on_entries_that_may_be_missing(kind, depends):
 @pytest.mark.parametrize("eta", [0.05, 0.3, 0.9])
 def test_the_realised_ratio_of_mcar_is_eta(eta):
     x = torch.zeros(2000, OBS)
-    missing = 1 - sample_observed(eta, x, seeded(1)).double()
+    missing = 1 - sample_mask(eta, x, seeded(1)).double()
     error = math.sqrt(eta * (1 - eta) / x.numel())
     assert abs(missing.mean() - eta) < 3 * error
     # every component, the first as much as the last
@@ -152,14 +152,14 @@ def test_the_realised_ratio_of_mcar_is_eta(eta):
 def test_realised_ratios_follow_the_probabilities(kind):
     x, action = example((1,))
     probability = missing_probability(mechanism(kind), x, action, 0.5)
-    draws = sample_observed(probability.expand(20_000, OBS), x.expand(20_000, OBS), seeded(2))
+    draws = sample_mask(probability.expand(20_000, OBS), x.expand(20_000, OBS), seeded(2))
     realised = 1 - draws.double().mean(0)
     error = (probability[0] * (1 - probability[0]) / 20_000).sqrt()
     assert ((realised - probability[0]).abs() <= 4 * error).all()
 
 
 def test_entries_go_missing_independently():
-    missing = 1 - sample_observed(0.4, torch.zeros(20_000, 4), seeded(3)).double()
+    missing = 1 - sample_mask(0.4, torch.zeros(20_000, 4), seeded(3)).double()
     correlation = torch.corrcoef(missing.T) - torch.eye(4)
     assert correlation.abs().max() < 4 / math.sqrt(20_000)
 
@@ -168,28 +168,28 @@ def test_entries_go_missing_independently():
 def test_always_observed_entries_never_go_missing(kind):
     drawn = mechanism(kind)
     x, action = example((5000,))
-    observed = sample_observed(missing_probability(drawn, x, action, 1.0), x, seeded(4))
+    observed = sample_mask(missing_probability(drawn, x, action, 1.0), x, seeded(4))
     assert observed[:, drawn.always_observed].all()
     assert not observed[:, ~drawn.always_observed].all(0).any()
 
 
 def test_eta_zero_loses_nothing_and_eta_one_everything():
     x = torch.zeros(500, OBS)
-    assert sample_observed(0.0, x, seeded()).all()
-    assert not sample_observed(1.0, x, seeded()).any()
+    assert sample_mask(0.0, x, seeded()).all()
+    assert not sample_mask(1.0, x, seeded()).any()
 
 
 def test_a_mask_depends_on_the_generator_and_not_on_the_dtype():
     x = torch.zeros(50, OBS)
-    first = sample_observed(0.5, x, seeded(6))
-    assert torch.equal(first, sample_observed(0.5, x.double(), seeded(6)))
-    assert not torch.equal(first, sample_observed(0.5, x, seeded(7)))
+    first = sample_mask(0.5, x, seeded(6))
+    assert torch.equal(first, sample_mask(0.5, x.double(), seeded(6)))
+    assert not torch.equal(first, sample_mask(0.5, x, seeded(7)))
 
 
 def test_a_nan_is_not_hidden_by_the_mask_that_it_would_upset():
     x, action = example()
     x[0, 0] = math.nan
-    observed = sample_observed(missing_probability(mechanism("nmar"), x, action, 0.5), x, seeded())
+    observed = sample_mask(missing_probability(mechanism("nmar"), x, action, 0.5), x, seeded())
     assert observed[0].all()
 
 
@@ -332,7 +332,7 @@ def test_the_global_generator_is_neither_read_nor_advanced():
         probability = missing_probability(drawn, x, action, 0.5)
         results.append(
             (
-                sample_observed(probability, x, generator),
+                sample_mask(probability, x, generator),
                 sample_noise(1.0, x, generator),
                 sample_working(None, outage_rates(0.5, 5), x, generator),
                 *sample_spikes(0.5, 1.0, x, generator),

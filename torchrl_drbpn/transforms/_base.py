@@ -1,0 +1,376 @@
+"""What the transforms share: keys, specs, order, and the frame of those that corrupt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import dispatch
+from torch import Tensor
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform, TransformedEnv
+
+from torchrl_drbpn.functional.gaussian import zero_missing
+
+Keys: TypeAlias = NestedKey | Sequence[NestedKey]
+Role = Literal["noise", "missingness", "from_nan", "fill"]
+
+
+# ------------------------------------------------------------------------------------------- keys
+def as_key_list(keys: Keys) -> list[NestedKey]:
+    """Return one key, or a list of keys, as a list; a tuple of strings is one nested key."""
+    items: list[Any] = [keys] if isinstance(keys, str | tuple) else list(keys)
+    for place, key in enumerate(items):
+        # configurations know no tuples: inside a list, a list of strings is a nested key as well
+        flat = [key] if isinstance(key, str) or not isinstance(key, Sequence) else list(key)
+        if not flat or not all(isinstance(part, str) for part in flat):
+            raise TypeError(
+                "a key must be a string or a tuple of strings and several keys a list of those, "
+                f"got {key!r} of type {type(key).__name__}."
+            )
+        items[place] = unravel_key(tuple(flat))
+    return items
+
+
+def sibling_key(key: NestedKey, name: str) -> NestedKey:
+    """Return the key called `name` that lies beside `key`."""
+    return (*key[:-1], name) if isinstance(key, tuple) else name
+
+
+def pair_keys(
+    in_keys: Sequence[NestedKey], keys: Keys | None, *, name: str, default: str
+) -> list[NestedKey]:
+    """Return one key for each in_key: those given as `name`, or `default` beside each in_key."""
+    pairs = [sibling_key(key, default) for key in in_keys] if keys is None else as_key_list(keys)
+    if len(pairs) != len(in_keys) or len(set(pairs)) != len(pairs):
+        raise ValueError(
+            f"`{name}` must name one key of its own for each of the {len(in_keys)} in_keys "
+            f"{list(in_keys)}, got {pairs}. Pass a list of {len(in_keys)} different keys."
+        )
+    return pairs
+
+
+# ------------------------------------------------------------------------------------------- data
+def read(tensordict: TensorDictBase, key: NestedKey, owner: Transform) -> Tensor:
+    """Return the entry under `key`, or raise a KeyError that names the transform and the key."""
+    value: Tensor | None = tensordict.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"`{type(owner).__name__}` reads {key!r}, which is not among the keys "
+            f"{sorted(map(str, tensordict.keys(True, True)))}. Pass the key that your environment "
+            "writes."
+        )
+    return value
+
+
+def check_vector(
+    given: Tensor | TensorSpec, key: NestedKey, owner: Transform, batch_dims: int | None = None
+) -> None:
+    """Refuse an observation that is not a vector of floats; with `batch_dims`, one a row."""
+    vector = given.ndim > 0 if batch_dims is None else given.ndim == batch_dims + 1
+    if not vector or not given.dtype.is_floating_point:
+        raise ValueError(
+            f"`{key}` must be a vector of floating point numbers of shape (*batch, obs) for "
+            f"`{type(owner).__name__}`, got {given.dtype} of shape {tuple(given.shape)}. Flatten "
+            "or cast it first, as with FlattenObservation, CatTensors or DTypeCastTransform."
+        )
+
+
+def check_mask(mask: Tensor | TensorSpec, observation: Tensor | TensorSpec, key: NestedKey) -> None:
+    """Refuse a mask that is not bool with one entry for every component of its observation."""
+    if mask.dtype != torch.bool or mask.shape != observation.shape:
+        raise ValueError(
+            f"`{key}` must be bool of shape (*batch, obs) = {tuple(observation.shape)}, one entry "
+            f"per component, got {mask.dtype} {tuple(mask.shape)}. Is it the mask of another "
+            "observation? Pass mask_keys=... ."
+        )
+
+
+def flagged_rows(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> Tensor | None:
+    """Return the rows that `"_reset"`, beside `key` or above it, marks, spread over `value`."""
+    folders = key[:-1] if isinstance(key, tuple) else ()
+    for depth in range(len(folders), -1, -1):
+        flag = tensordict.get((*folders[:depth], "_reset"), None)
+        if flag is not None:
+            rows = flag.flatten(tensordict.ndim).any(-1) if flag.ndim > tensordict.ndim else flag
+            return rows.reshape(*rows.shape, *(1,) * (value.ndim - rows.ndim)).expand_as(value)
+    return None
+
+
+# ------------------------------------------------------------------------------------------ specs
+def observation_leaf(spec: Composite, key: NestedKey, owner: Transform) -> TensorSpec:
+    """Return the spec under `key`, shape `(*batch, obs)`, which must be a vector of floats."""
+    if key not in spec.keys(True, True):
+        raise KeyError(
+            f"`{type(owner).__name__}` reads {key!r}, which is not among the observations "
+            f"{sorted(map(str, spec.keys(True, True)))} of the environment. Pass in_keys=... ."
+        )
+    parent = spec[key[:-1]] if isinstance(key, tuple) else spec
+    check_vector(spec[key], key, owner, parent.ndim)
+    return spec[key]
+
+
+def unbounded_like(leaf: TensorSpec) -> Unbounded:
+    """Return an unbounded spec with the shape, device and dtype of `leaf`."""
+    return Unbounded(shape=leaf.shape, device=leaf.device, dtype=leaf.dtype)
+
+
+def mask_like(leaf: TensorSpec) -> Binary:
+    """Return the spec of a boolean mask with the shape and device of `leaf`."""
+    return Binary(shape=leaf.shape, device=leaf.device, dtype=torch.bool)
+
+
+def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transform) -> None:
+    """Enter a key into `spec` that nothing else may write."""
+    if key in spec.keys(True, True):
+        raise ValueError(
+            f"`{key}` is among the observations of the environment already, so "
+            f"`{type(owner).__name__}` can't write it: another transform (perhaps inside the "
+            "workers) or the environment itself does. Pass another key."
+        )
+    spec[key] = leaf
+
+
+# ------------------------------------------------------------------------------------------ order
+def transforms_before(transform: Transform) -> Iterator[Transform]:
+    """Yield the transforms that work before `transform`, in its environment and those inside it.
+
+    Transforms inside the workers of a batched environment can't be seen.
+    """
+    env = transform.parent
+    while isinstance(env, TransformedEnv):
+        yield from (part for part in env.transform.modules() if isinstance(part, Transform))
+        env = env.base_env
+
+
+# ------------------------------------------------------------------------------------- transforms
+class EnvironmentTransform(Transform):
+    """A transform that makes sense in an environment alone: it refuses stored data.
+
+    A replay buffer calls `inv` on what comes in and `forward` on what goes out. Subclasses say in
+    `why_online` why they can do neither.
+    """
+
+    why_online: ClassVar[str]
+
+    def _refuse(self) -> NotImplementedError:
+        name = type(self).__name__
+        return NotImplementedError(
+            f"`{name}` {self.why_online}, so that it can't work on a replay buffer or in front of "
+            f"a model. Append it to the environment: TransformedEnv(env, {name}(...))."
+        )
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        try:
+            env = self.container
+        except ValueError:  # inside a Compose that belongs to no environment
+            env = None
+        if env is None:
+            raise self._refuse()
+        return tensordict
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        """Refuse to work outside an environment.
+
+        Args:
+            tensordict: data of a replay buffer or in front of a model.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise self._refuse()
+
+
+class Step(NamedTuple):
+    """What a corrupting transform is given.
+
+    Attributes:
+        observation: shape `(*batch, obs)`, the keys of one vector side by side.
+        observed: the mask so far, bool, same shape; None for all. Entries that it hides hold 0 in
+            the end, whatever is made of them.
+        before: the data of the step before, with the action; None at a reset.
+        data: the data of this step, where what was drawn may be written.
+    """
+
+    observation: Tensor
+    observed: Tensor | None
+    before: TensorDictBase | None
+    data: TensorDictBase
+
+
+class CorruptingTransform(Transform):
+    """The frame of the transforms that change what arrives: keys, masks, specs, step and reset.
+
+    Several observation keys count as one vector, in the order of `in_keys`, so that one law holds
+    for the whole observation however it is cut into keys; keys under `"next"` are a vector of
+    their own. A subclass writes `_corrupt`.
+
+    Args:
+        in_keys: observation keys; the corrupted observation is written under the same key.
+        mask_keys: one mask per observation; by default `observed` beside it.
+        complete_key: where the observation as it arrives is recorded; one key per observation, or
+            None for not at all.
+    """
+
+    role: ClassVar[Role]
+    writes_mask: ClassVar[bool] = True
+    out_keys: list[NestedKey]
+
+    def __init__(
+        self,
+        *,
+        in_keys: Keys = ("observation",),
+        mask_keys: Keys | None = None,
+        complete_key: Keys | None = None,
+    ) -> None:
+        keys = as_key_list(in_keys)
+        if not keys:
+            raise ValueError("`in_keys` must name at least one observation, got none.")
+        masks = pair_keys(keys, mask_keys, name="mask_keys", default="observed")
+        complete: list[NestedKey] = []
+        if complete_key is not None:
+            complete = pair_keys(keys, complete_key, name="complete_key", default="")
+        out_keys = [*keys, *(masks if self.writes_mask else []), *complete]
+        super().__init__(in_keys=keys, out_keys=out_keys)
+        self.mask_keys, self.complete_keys = masks, complete
+        of_next = [isinstance(key, tuple) and key[0] == "next" for key in keys]
+        self._vectors = [
+            [place for place, there in enumerate(of_next) if there is following]
+            for following in sorted(set(of_next))
+        ]
+
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+        """Return the observation as it arrives, and which entries do; None for all."""
+        raise NotImplementedError
+
+    def _check_obs_dim(self, obs_dim: int) -> None:
+        """Raise a ValueError where the transform was made for another number of components."""
+
+    # ------------------------------------------------------------------------------- on tensors
+    def _run(self, tensordict: TensorDictBase, before: TensorDictBase | None) -> TensorDictBase:
+        if self.missing_tolerance and any(tensordict.get(k, None) is None for k in self.in_keys):
+            return tensordict
+        for places in self._vectors:
+            parts, masks = [], []
+            for key, mask_key in ((self.in_keys[i], self.mask_keys[i]) for i in places):
+                part, mask = read(tensordict, key, self), tensordict.get(mask_key, None)
+                check_vector(part, key, self)
+                if mask is not None:
+                    check_mask(mask, part, mask_key)
+                parts.append(part)
+                masks.append(mask)
+            self._check_batches(parts)
+            observed = None
+            if any(mask is not None for mask in masks):
+                pairs = zip(parts, masks, strict=True)
+                masks = [torch.ones_like(p, dtype=torch.bool) if m is None else m for p, m in pairs]
+                observed = _join(masks)
+            corrupted, arrived = self._corrupt(Step(_join(parts), observed, before, tensordict))
+            if observed is not None:
+                arrived = observed if arrived is None else arrived & observed
+            if arrived is not None:
+                corrupted = zero_missing(corrupted, arrived)
+            sizes = [part.shape[-1] for part in parts]
+            if self.complete_keys:
+                self._write(tensordict, [self.complete_keys[i] for i in places], parts)
+            self._write(
+                tensordict, [self.in_keys[i] for i in places], torch.split(corrupted, sizes, -1)
+            )
+            if self.writes_mask and arrived is not None:
+                self._write(
+                    tensordict, [self.mask_keys[i] for i in places], torch.split(arrived, sizes, -1)
+                )
+        return tensordict
+
+    @staticmethod
+    def _write(tensordict: TensorDictBase, keys: list[NestedKey], parts: Sequence[Tensor]) -> None:
+        for key, part in zip(keys, parts, strict=True):
+            tensordict.set(key, part)
+
+    def _check_batches(self, parts: Sequence[Tensor | TensorSpec]) -> None:
+        if any(part.shape[:-1] != parts[0].shape[:-1] for part in parts):
+            raise ValueError(
+                f"`in_keys` {self.in_keys} must share their batch to count as one vector, got "
+                f"shapes {[tuple(part.shape) for part in parts]}. Give each batch a transform of "
+                "its own."
+            )
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._run(next_tensordict, None)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._run(next_tensordict, tensordict)
+
+    def _reset(
+        self,
+        tensordict: TensorDictBase,  # noqa: ARG002
+        tensordict_reset: TensorDictBase,
+    ) -> TensorDictBase:
+        # the first observation of an episode arrives through the same sensors as every other
+        return self._run(tensordict_reset, None)
+
+    @dispatch(source="in_keys", dest="out_keys")
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Apply the transform to data outside an environment, as on a replay buffer.
+
+        Args:
+            tensordict: data with the observation keys, any batch shape.
+
+        Returns:
+            The same data, changed.
+        """
+        return self._call(tensordict)
+
+    # ------------------------------------------------------------------------------------- specs
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Widen the observation, enter its mask and, on request, the complete observation.
+
+        Args:
+            observation_spec: the spec before the transform.
+
+        Returns:
+            The spec after it.
+
+        Raises:
+            KeyError: if an observation key is absent.
+            ValueError: if an observation is no vector, a key is taken by something else, or the
+                transforms before this one are out of order.
+        """
+        self._check_order()
+        spec = observation_spec.clone()
+        leaves = [observation_leaf(spec, key, self) for key in self.in_keys]
+        self._check_batches(leaves)
+        self._check_obs_dim(sum(leaf.shape[-1] for leaf in leaves))
+        for key, leaf in zip(self.complete_keys, leaves, strict=bool(self.complete_keys)):
+            enter_new(spec, key, leaf.clone(), self)
+        for key, mask_key, leaf in zip(self.in_keys, self.mask_keys, leaves, strict=True):
+            if mask_key in spec.keys(True, True):
+                check_mask(spec[mask_key], leaf, mask_key)
+            if self.writes_mask:
+                spec[mask_key] = mask_like(leaf)
+            spec[key] = unbounded_like(leaf)
+        return spec
+
+    def _check_order(self) -> None:
+        name, keys = type(self).__name__, set(self.in_keys)
+        for earlier in transforms_before(self):
+            role, other = getattr(earlier, "role", None), type(earlier).__name__
+            if role is None or keys.isdisjoint([*earlier.in_keys, *earlier.out_keys]):
+                continue
+            if role == "fill" and self.role != "noise":
+                raise ValueError(
+                    f"`{other}` stands before `{name}`: what goes missing afterwards is never "
+                    f"filled. Put `{other}` after `{name}`."
+                )
+            # ObservedFromNaN destroys nothing: the complete observation may be recorded after it
+            if self.complete_keys and role in ("noise", "missingness"):
+                raise ValueError(
+                    f"`{name}` is asked for {self.complete_keys} but `{other}` has corrupted the "
+                    f"observation before it. Pass complete_key to `{other}` instead."
+                )
+
+
+def _join(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
