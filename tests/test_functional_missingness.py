@@ -1,4 +1,4 @@
-"""What `functional/corruption.py` promises: the laws of missingness and noise.
+"""What `functional/missingness.py` promises: the laws of missingness and noise.
 
 MCAR: every entry missing with probability eta. MAR and NMAR: P(missing_i) = min(sigmoid(b1_i . a +
 b2_i . x + b0_i), eta), x being the always observed entries (MAR) or all (NMAR); 0 for the always
@@ -47,7 +47,7 @@ def example(batch=(4,), seed=5):
 # -------------------------------------------------------------------------------- the mechanism
 @pytest.mark.parametrize(
     ("obs", "share", "count"),
-    [(17, 0.25, 4), (11, 0.25, 3), (27, 0.25, 7), (1, 0.25, 1), (4, 0.0, 1), (4, 1.0, 4)],
+    [(17, 0.25, 4), (11, 0.25, 3), (27, 0.25, 7), (4, 0.0, 1), (4, 0.8, 3)],
 )
 def test_the_number_of_always_observed_entries_is_the_rounded_share_and_at_least_one(
     obs, share, count
@@ -87,6 +87,12 @@ def test_weights_are_standard_normal():
 def test_a_share_outside_the_unit_interval_is_refused(share):
     with pytest.raises(ValueError, match=r"`always_observed` must be a share in \[0, 1\]"):
         mechanism("mar", always_observed=share)
+
+
+@pytest.mark.parametrize(("obs", "share"), [(1, 0.0), (9, 1.0), (9, 0.95)])
+def test_a_mechanism_that_loses_nothing_is_refused(obs, share):
+    with pytest.raises(ValueError, match="`always_observed` must leave an entry that can go miss"):
+        draw_mechanism("mar", obs, ACTION, always_observed=share, generator=seeded())
 
 
 def test_mcar_has_no_mechanism_to_draw():

@@ -1,23 +1,18 @@
-"""What the corrupting transforms promise: their contracts, keys, specs, masks and errors.
+"""What the corrupting transforms promise beyond `test_transforms_requirements.py`.
 
-Each of ObservationMissingness, ObservationNoise, SensorReduction and ObservedFromNaN goes through
-`contracts.TransformContract`. On top: what is missing is 0 and False in the mask; a mask that is
-there already is ANDed, and garbage beneath it is harmless; several observation keys count as one
-vector; specs say what is written; bad input gives one clear error; TorchRL's DQN parts work on it.
+Specs say what is written; several observation keys count as one vector; a mask that is there is
+ANDed; sensors and spikes of each row or component; bad input gives one clear line; TorchRL's DQN
+parts work on corrupted observations.
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
-from contracts import (
-    ACTION,
-    OBS,
-    StaircaseEnv,
-    TransformContract,
-)
+from contracts import ACTION, OBS, StaircaseEnv
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
@@ -28,6 +23,7 @@ from torchrl.envs import (
     Compose,
     GymEnv,
     ObservationTransform,
+    SerialEnv,
     Transform,
     TransformedEnv,
 )
@@ -35,14 +31,19 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 
 from torchrl_drbpn.transforms import (
+    FillLastObserved,
     ObservationMissingness,
     ObservationNoise,
+    ObservationSpikes,
     ObservedFromNaN,
     SensorReduction,
     seed_env,
 )
 
 COMPLETE = "complete_observation"
+MISSING = partial(ObservationMissingness, "mcar", 0.5)
+NOISE = partial(ObservationNoise, 0.1)
+SPIKES = partial(ObservationSpikes, 0.1, 5.0)
 
 
 def staircase(*transforms, **kwargs):
@@ -53,96 +54,16 @@ def data(value=1.0, batch=(4,), **more):
     return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
-# ------------------------------------------------------------------------------------ the contracts
-class MaskContract(TransformContract):
-    def check_output(self, before, after):
-        observation, observed = after["observation"], after["observed"]
-        assert observed.dtype == torch.bool
-        assert observed.shape == observation.shape
-        assert (observation[~observed] == 0).all()
-        assert torch.isfinite(observation).all()
-        if before.get("observation", None) is not None:
-            assert torch.equal(observation[observed], before["observation"][observed])
-
-
-class TestMcar(MaskContract):
-    def make_transform(self):
-        return ObservationMissingness("mcar", 0.5)
-
-
-class TestNmar(MaskContract):
-    keeps_float64 = ("observation", COMPLETE)
-
-    def make_transform(self):
-        return ObservationMissingness("nmar", 0.9, complete_key=COMPLETE)
-
-
-class TestMar(MaskContract):
-    def make_transform(self):
-        return ObservationMissingness("mar", 0.9)
-
-
-class TestSensorReduction(MaskContract):
-    offline = "works"
-
-    def make_transform(self):
-        return SensorReduction([0, -1])
-
-    def check_output(self, before, after):
-        super().check_output(before, after)
-        assert not after["observed"][..., [0, -1]].any()
-        assert after["observed"][..., 1:-1].all()
-
-
-class TestObservedFromNaN(MaskContract):
-    offline = "works"
-
-    def make_transform(self):
-        return ObservedFromNaN()
-
-    def make_data(self, batch, dtype=torch.float32):
-        made = super().make_data(batch, dtype)
-        made["observation"][..., 1] = math.nan
-        return made
-
-    def check_output(self, before, after):
-        super().check_output(before, after)
-        if before.get("observation", None) is not None:
-            assert torch.equal(after["observed"], ~before["observation"].isnan())
-
-    # the data holds NaN, which differs from itself
-    def test_transform_inverse(self):
-        made = self.make_data((3,))
-        after = self.make_transform().inv(made.clone())
-        assert torch.equal(after["observation"].isnan(), made["observation"].isnan())
-
-
-class TestNoise(TransformContract):
-    keeps_float64 = ("observation", COMPLETE)
-
-    def make_transform(self):
-        return ObservationNoise(0.1, complete_key=COMPLETE)
-
-    def check_output(self, before, after):
-        noise = after["observation"] - after[COMPLETE]
-        assert after.get("observed", None) is None
-        assert (noise != 0).all()
-        assert (noise.abs() < 1).all()
-        if before.get("observation", None) is not None:
-            assert torch.equal(after[COMPLETE], before["observation"])
-
-
 # ----------------------------------------------------------------------------------- keys and specs
 def test_specs_say_what_is_written():
-    env = staircase(
-        ObservationNoise(0.1, complete_key=COMPLETE), ObservationMissingness("mcar", 0.5)
-    )
+    env = staircase(SPIKES(complete_key=COMPLETE, spiked_key="hit"), MISSING())
     bounded = StaircaseEnv().observation_spec["observation"]
     spec = env.observation_spec
     assert isinstance(spec["observation"], Unbounded)
-    assert isinstance(spec["observed"], Binary)
-    assert spec["observed"].dtype == torch.bool
-    assert spec["observed"].shape == spec["observation"].shape == bounded.shape
+    for mask in ("observed", "hit"):
+        assert isinstance(spec[mask], Binary)
+        assert spec[mask].dtype == torch.bool
+        assert spec[mask].shape == spec["observation"].shape == bounded.shape
     assert spec[COMPLETE] == bounded
 
 
@@ -173,11 +94,11 @@ class SplitObservation(Transform):
 
 @pytest.mark.parametrize("mechanism", ["mcar", "mar", "nmar"])
 def test_several_keys_are_one_vector_cut_into_pieces(mechanism):
-    whole = staircase(ObservationMissingness(mechanism, 0.6))
+    whole = staircase(ObservationMissingness(mechanism, 0.6, seed=0))
     keys, masks = ["position", "velocity"], ["position_seen", "velocity_seen"]
     pieces = staircase(
         SplitObservation(keys, [2, 3]),
-        ObservationMissingness(mechanism, 0.6, in_keys=keys, mask_keys=masks),
+        ObservationMissingness(mechanism, 0.6, seed=0, in_keys=keys, mask_keys=masks),
         CatTensors(keys, "observation", dim=-1, del_keys=False),
     )
     torch.manual_seed(0)
@@ -189,17 +110,20 @@ def test_several_keys_are_one_vector_cut_into_pieces(mechanism):
     assert torch.equal(received["next", "observation"], expected["next", "observation"])
 
 
-def test_noise_per_component_spans_several_keys():
-    both = TensorDict({"a": torch.zeros(4, 2), "b": torch.zeros(4, 3)}, [4])
-    noise = ObservationNoise(
-        [0, 0, 0, 1, 0], in_keys=["a", "b"], mask_keys=["ma", "mb"], complete_key=["ca", "cb"]
-    )
-    after = noise._call(both)
+def test_numbers_per_component_span_several_keys():
+    keys = {"in_keys": ["a", "b"], "mask_keys": ["ma", "mb"]}
+    both = TensorDict({"a": torch.zeros(400, 2), "b": torch.zeros(400, 3)}, [400])
+    noise = ObservationNoise([0, 0, 0, 1, 0], complete_key=["ca", "cb"], **keys)
+    after = noise._call(both.clone())
     assert (after["a"] == 0).all()
     assert ((after["b"] != 0) == torch.tensor([False, True, False])).all()
-    assert (after["ca"] == 0).all()
-    assert (after["cb"] == 0).all()
-    assert after.get("ma", None) is None
+    assert torch.equal(after["ca"], both["a"])
+    spikes = ObservationSpikes([0, 1, 0, 1, 0], [1, 1, 1, 100, 1], spiked_key=["ha", "hb"], **keys)
+    after = spikes._call(both)
+    assert ((after["a"] != 0) == torch.tensor([False, True])).all()
+    assert torch.equal(after["ha"], after["a"] != 0)
+    assert torch.equal(after["hb"], after["b"] != 0)
+    assert after["b"][:, 1].std() > 50 > 5 > after["a"][:, 1].std()
 
 
 def test_a_nested_observation_has_its_mask_beside_it():
@@ -210,25 +134,12 @@ def test_a_nested_observation_has_its_mask_beside_it():
     assert after.get("observed", None) is None
 
 
-def test_two_observations_need_two_masks():
-    with pytest.raises(ValueError, match="`mask_keys` must name one key of its own for each"):
-        ObservationMissingness("mcar", 0.5, in_keys=["a", "b"])
-    with pytest.raises(ValueError, match="`complete_key` must name one key of its own"):
-        ObservationNoise(0.1, in_keys=["a", "b"], mask_keys=["ma", "mb"], complete_key="c")
-    with pytest.raises(TypeError, match="a key must be a string"):
-        ObservationMissingness("mcar", 0.5, in_keys=[3])
-
-
-def test_a_nested_key_may_come_as_a_list_as_configurations_write_it():
-    missing = ObservationMissingness("mcar", 0.5, in_keys=[["agents", "observation"]])
-    assert missing.in_keys == [("agents", "observation")]
-    assert missing.mask_keys == [("agents", "observed")]
-
-
-def test_an_observation_that_the_environment_lacks_is_named():
-    env = TransformedEnv(StaircaseEnv(), ObservationMissingness("mcar", 0.5, in_keys="state"))
-    with pytest.raises(KeyError, match=r"reads 'state', which is not among .*'observation'"):
-        env.reset()
+def test_keys_of_different_batch_are_no_vector():
+    nested = TensorDict({"observation": torch.ones(2, 3, OBS)}, [2, 3])
+    both = TensorDict({"agents": nested, "observation": torch.ones(2, OBS)}, [2])
+    transform = MISSING(in_keys=["observation", ("agents", "observation")])
+    with pytest.raises(ValueError, match=r"must share their batch .* \[\(2, 5\), \(2, 3, 5\)\]"):
+        transform._call(both)
 
 
 class Reshape(ObservationTransform):
@@ -268,51 +179,47 @@ def existing_mask():
 
 
 @pytest.mark.parametrize(
-    "transform",
+    "make",
     [
-        ObservationMissingness("mcar", 0.3),
-        ObservationMissingness("nmar", 0.3),
-        SensorReduction([0]),
-        ObservedFromNaN(),
+        partial(ObservationMissingness, "mcar", 0.3),
+        partial(ObservationMissingness, "nmar", 0.3),
+        partial(SensorReduction, [0]),
+        ObservedFromNaN,
     ],
     ids=["mcar", "nmar", "reduction", "nan"],
 )
-def test_a_mask_that_is_there_is_anded_and_garbage_beneath_it_is_harmless(transform):
-    transform = transform.clone()
+def test_a_mask_that_is_there_is_anded(make):
     root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
-    before = data(1.0, observed=existing_mask())
-    before["observation"][:, 2] = math.nan
-    after = transform._step(root, before)
+    after = make()._step(root, data(1.0, observed=existing_mask()))
     assert not after["observed"][:, 2].any()
     assert after["observed"].any()
     assert torch.equal(after["observation"], after["observed"].float())
 
 
-def test_garbage_beneath_a_mask_does_not_enter_the_law():
-    root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
-    drawn = []
-    for beneath in (0.0, math.nan, math.inf, 1e6):
-        before = data(1.0, observed=existing_mask())
-        before["observation"][:, 2] = beneath
-        drawn.append(ObservationMissingness("nmar", 0.9)._step(root, before)["observed"])
-    assert not drawn[0].all(0)[[0, 1, 3, 4]].all()
-    assert all(torch.equal(mask, drawn[0]) for mask in drawn)
-
-
-def test_noise_leaves_missing_entries_at_zero():
-    after = ObservationNoise(1.0)._call(data(0.0, observed=existing_mask()))
-    assert (after["observation"][:, 2] == 0).all()
-    assert (after["observation"][:, [0, 1, 3, 4]] != 0).all()
-    assert torch.equal(after["observed"], existing_mask())
-
-
 @pytest.mark.parametrize(
-    "mask", [torch.ones(4, 1, dtype=torch.bool), torch.ones(4, OBS)], ids=["shape", "dtype"]
+    "transform", [ObservationNoise(1.0), ObservationSpikes(1.0, 5.0, spiked_key="hit")], ids=type
 )
-def test_a_mask_of_the_wrong_shape_or_dtype_is_refused(mask):
-    for transform in (ObservationMissingness("mcar", 0.5), ObservationNoise(0.1)):
-        with pytest.raises(ValueError, match=r"`observed` must be bool of shape .* = \(4, 5\)"):
-            transform._call(data(observed=mask))
+def test_missing_entries_are_neither_changed_nor_filled(transform):
+    after = transform._call(data(0.0, observed=existing_mask()))
+    assert torch.equal(after["observation"] != 0, existing_mask())
+    assert torch.equal(after["observed"], existing_mask())
+    assert torch.equal(after.get("hit", existing_mask()), existing_mask())
+
+
+def test_a_spiked_entry_has_arrived():
+    spikes = ObservationSpikes(1.0, 5.0, complete_key=COMPLETE, spiked_key="hit")
+    after = staircase(spikes, MISSING(), batch=20).reset()
+    arrived = after["observed"]
+    assert after["hit"].all()
+    assert 0 < arrived.double().mean() < 1
+    assert (after["observation"][arrived] != after[COMPLETE][arrived]).all()
+
+
+def test_readings_are_hit_with_their_probability_at_resets_as_at_steps():
+    spikes = ObservationSpikes(0.05, 20.0, seed=0, complete_key=COMPLETE, spiked_key="hit")
+    rollout = staircase(spikes, batch=3000, horizon=9).rollout(5)
+    share = rollout["hit"].double().mean((0, 2))
+    assert ((share - 0.05).abs() < 4 * math.sqrt(0.05 * 0.95 / (3000 * OBS))).all()
 
 
 def test_infinite_values_are_errors_and_not_gaps():
@@ -368,43 +275,141 @@ def test_sensors_that_do_not_exist_are_refused(missing):
         SensorReduction([0.5])
 
 
+# -------------------------------------------------------------------------------------------- order
+def nested(first, second):
+    return TransformedEnv(StaircaseEnv(), Compose(Compose(first), Compose(second)))
+
+
+def appended(first, second):
+    return TransformedEnv(StaircaseEnv(), first).append_transform(second)
+
+
+def inserted(first, second):
+    return staircase(second).insert_transform(0, first)
+
+
+def wrapped_twice(first, second):
+    return TransformedEnv(TransformedEnv(StaircaseEnv(), first), second, auto_unwrap=False)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (FillLastObserved, MISSING, "`FillLastObserved` stands before `ObservationMissingness`"),
+        (FillLastObserved, ObservedFromNaN, "`FillLastObserved` stands before `ObservedFromNaN`"),
+        (NOISE, partial(MISSING, complete_key=COMPLETE), "has corrupted the observation before"),
+        (
+            partial(NOISE, complete_key=COMPLETE),
+            partial(SPIKES, in_keys="other", complete_key=COMPLETE),
+            "`complete_observation` is among the observations of the environment already",
+        ),
+    ],
+    ids=["fill", "fill NaN", "complete", "two writers"],
+)
+@pytest.mark.parametrize("put_together", [staircase, nested, appended, inserted, wrapped_twice])
+def test_a_wrong_order_is_refused_at_the_first_use(before, after, message, put_together):
+    if "already" in message:
+        pair = Copy(), Compose(before(), after())
+    elif "Fill" in message:
+        pair = Compose(SensorReduction([0]), before()), after()
+    else:
+        pair = before(), after()
+    with pytest.raises(ValueError, match=message):
+        put_together(*pair).rollout(2)
+
+
+class Copy(Transform):
+    """Write the observation under `other` as well."""
+
+    def _call(self, tensordict):
+        return tensordict.set("other", tensordict["observation"].clone())
+
+    def _reset(self, tensordict, tensordict_reset):
+        del tensordict
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, spec):
+        return spec.set("other", spec["observation"].clone())
+
+
+def test_the_order_of_the_recipe_is_accepted_and_other_keys_do_not_matter():
+    noise = partial(NOISE, complete_key=COMPLETE)
+    for chain in (
+        [noise(), SPIKES(), MISSING()],
+        [ObservedFromNaN(), noise(), MISSING(), FillLastObserved()],
+        [Copy(), MISSING(), FillLastObserved(), MISSING(in_keys="other", mask_keys="other_seen")],
+    ):
+        rollout = staircase(*chain).rollout(2)
+        assert {"observation", "observed"} <= set(rollout.keys())
+
+
+def test_a_writer_inside_the_workers_is_found_through_the_specs():
+    env = SerialEnv(2, lambda: staircase(NOISE(complete_key=COMPLETE)))
+    with pytest.raises(ValueError, match="is among the observations of the environment already"):
+        TransformedEnv(env, MISSING(complete_key=COMPLETE)).reset()
+    env.close()
+
+
 # ------------------------------------------------------------------------------------------- errors
-@pytest.mark.parametrize("eta", [-0.1, 1.1, math.nan, "0.5", None])
+@pytest.mark.parametrize("eta", [-0.1, 1.1, math.nan, True, "0.5", None])
 def test_a_missing_rate_lies_in_the_unit_interval(eta):
     with pytest.raises(ValueError, match=r"`eta` must be a missing rate in \[0, 1\]"):
         ObservationMissingness("mcar", eta)
+    env = staircase(ObservationMissingness("mcar", 0.0))
+    assert env.reset()["observed"].all()
+    with pytest.raises(ValueError, match=r"`eta` must be a missing rate in \[0, 1\]"):
+        env.transform[0].eta = eta
+    env.transform[0].eta = 1.0
+    assert not env.reset()["observed"].any()
 
 
-def test_unknown_mechanisms_and_shares_are_refused():
+def test_mechanisms_that_are_unknown_or_lose_nothing_are_refused():
     with pytest.raises(ValueError, match=r"`mechanism` must be one of .*'mcar'.* got 'random'"):
         ObservationMissingness("random", 0.5)
-    with pytest.raises(ValueError, match="`always_observed` must be a share"):
+    with pytest.raises(ValueError, match=r"`always_observed` must be a share in \[0, 1\]"):
         ObservationMissingness("mar", 0.5, always_observed=2)
+    with pytest.raises(ValueError, match=r"`always_observed` must leave .* nothing is ever mis"):
+        ObservationMissingness("mar", 0.5, always_observed=1.0)
+    with pytest.raises(ValueError, match=r"`always_observed` must leave .* 0.95 of 5 entries"):
+        staircase(ObservationMissingness("mar", 0.5, always_observed=0.95)).reset()
 
 
-@pytest.mark.parametrize("std", [-1.0, math.nan, math.inf, [0.1, -0.1], [[0.1]], "much", None])
-def test_a_standard_deviation_is_finite_and_not_negative(std):
-    with pytest.raises(ValueError, match="`noise_std` must be a number or one number"):
-        ObservationNoise(std)
+@pytest.mark.parametrize("number", [-1.0, math.nan, math.inf, [0.1, -0.1], [[0.1]], "much", None])
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (ObservationNoise, "noise_std"),
+        (partial(ObservationSpikes, 0.1), "spike_std"),
+        (partial(ObservationSpikes, spike_std=1.0), "probability"),
+    ],
+    ids=["noise_std", "spike_std", "probability"],
+)
+def test_numbers_are_finite_not_negative_and_as_many_as_components(make, name, number):
+    with pytest.raises(ValueError, match=f"`{name}` must be a number or one number per component"):
+        make(number)
+    for use in (staircase(make([0.1, 0.2])).reset, lambda: make([0.1, 0.2])._call(data())):
+        with pytest.raises(ValueError, match=f"`{name}` must have one entry per component, 5"):
+            use()
 
 
-def test_standard_deviations_are_as_many_as_components():
-    with pytest.raises(ValueError, match="`noise_std` must have one entry per component, 5"):
-        _ = staircase(ObservationNoise([0.1, 0.2])).observation_spec
-    with pytest.raises(ValueError, match="`noise_std` must have one entry per component, 5"):
-        ObservationNoise([0.1, 0.2])._call(data())
+def test_probabilities_and_records_of_spikes_are_checked():
+    with pytest.raises(ValueError, match=r"`probability` must .* in \[0, 1\], got 1.1"):
+        ObservationSpikes(1.1, 1.0)
+    with pytest.raises(ValueError, match="`spiked_key` must name keys of its own"):
+        ObservationSpikes(0.1, 1.0, spiked_key="observed")
+    with pytest.raises(ValueError, match="`hit` is among the observations"):
+        staircase(SPIKES(spiked_key="hit"), SPIKES(spiked_key="hit")).reset()
 
 
 def test_mar_needs_an_action_that_is_a_vector():
     transform = ObservationMissingness("mar", 0.5)
-    with pytest.raises(KeyError, match="reads the action under 'action', which is not there"):
+    with pytest.raises(KeyError, match="`ObservationMissingness` reads 'action', which is not"):
         transform._step(TensorDict({}, [4]), data())
     env = TransformedEnv(GymEnv("CartPole-v1", categorical_action_encoding=True), transform)
-    with pytest.raises(ValueError, match="`action` must be a vector"):
-        env.reset()
-    env = staircase(ObservationMissingness("mar", 0.5, action_key="torque"))
-    with pytest.raises(KeyError, match=r"'torque', which is not among the actions \['action'\]"):
-        env.reset()
+    with pytest.raises(ValueError, match=r"`action` must be a vector .* one-hot actions"):
+        env.rollout(2)
+    with pytest.raises(KeyError, match="reads 'torque', which is not"):
+        staircase(ObservationMissingness("mar", 0.5, action_key="torque")).rollout(2)
 
 
 # ------------------------------------------------------------------------- in a pipeline of TorchRL

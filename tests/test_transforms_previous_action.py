@@ -2,42 +2,19 @@
 
 Specified here: the shift by one step with partial resets; that it is the action as the agent chose
 it, not as an action transform earlier in the chain or the environment changed it; that discrete
-actions keep dtype and shape; that nothing private leaks into the data. On top, the duties of every
-transform.
+actions keep dtype and shape, or become one-hot; that nothing private leaks into the data.
 """
 
 import pytest
 import torch
-from contracts import StaircaseEnv, TransformContract
+from contracts import StaircaseEnv
 from self_resetting import SelfResettingEnv
+from tensordict import TensorDict
 from torchrl.data import Bounded, Composite
 from torchrl.envs import ActionScaling, Compose, GymEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_drbpn.transforms import PreviousAction
-
-
-class TestPreviousActionContract(TransformContract):
-    keeps_float64 = ("previous_action",)
-
-    def make_transform(self):
-        return PreviousAction()
-
-    def make_data(self, batch, dtype=torch.float32):
-        data = super().make_data(batch, dtype)
-        return data.set("action", torch.zeros(*batch, 2, dtype=dtype))
-
-    def check_output(self, before, after):
-        previous = after["previous_action"]
-        assert previous.shape[:-1] == after.batch_size
-        assert previous.dtype.is_floating_point
-        assert previous.isfinite().all()
-
-    def test_an_absent_observation_is_named(self):
-        # what it reads is the action of the root
-        root = self.make_root((3,)).exclude("action")
-        with pytest.raises(KeyError, match=r"PreviousAction.*action"):
-            self.make_transform()._step(root, self.make_data((3,)))
 
 
 def expected_shift(data):
@@ -129,6 +106,36 @@ def test_a_discrete_action_keeps_dtype_and_shape(categorical):
     assert (data["previous_action"][0] == 0).all()
 
 
+@pytest.mark.parametrize("where", ["single", "inside", "outside"])
+def test_an_index_action_may_be_written_as_one_hot_and_is_zero_at_a_start(where):
+    def simulator():
+        return GymEnv("CartPole-v1", categorical_action_encoding=True)
+
+    def with_it(env):
+        return TransformedEnv(env, PreviousAction(one_hot=True))
+
+    if where == "single":
+        env = with_it(simulator())
+    elif where == "inside":
+        env = SerialEnv(2, lambda: with_it(simulator()))
+    else:
+        env = with_it(SerialEnv(2, simulator))
+    check_env_specs(env)
+    data = env.rollout(40, break_when_any_done=False)
+    following = data["next", "previous_action"]
+    assert torch.equal(following, torch.nn.functional.one_hot(data["action"], 2).float())
+    assert (data["previous_action"][..., 0, :] == 0).all()
+    over = data["next", "done"][..., :-1, 0]
+    assert over.any()
+    assert (data["previous_action"][..., 1:, :][over] == 0).all()
+
+
+def test_one_hot_needs_an_index():
+    for env in (GymEnv("CartPole-v1"), StaircaseEnv()):
+        with pytest.raises(ValueError, match="`one_hot` needs an index action"):
+            TransformedEnv(env, PreviousAction(one_hot=True)).reset()
+
+
 def test_nothing_private_is_left_in_the_data():
     env = TransformedEnv(StaircaseEnv(), PreviousAction())
     keys = {str(key) for key in env.rollout(3).keys(True, True)}
@@ -145,8 +152,5 @@ def test_an_absent_action_is_named():
     env = TransformedEnv(StaircaseEnv(), PreviousAction("torque"))
     with pytest.raises(KeyError, match=r"PreviousAction.*torque"):
         env.reset()
-
-
-def test_keys_must_come_in_pairs():
-    with pytest.raises(ValueError, match="`out_keys` must name one key"):
-        PreviousAction("action", ["a", "b"])
+    with pytest.raises(KeyError, match="`PreviousAction` reads 'action', which is not among"):
+        PreviousAction()._step(TensorDict(), TensorDict())

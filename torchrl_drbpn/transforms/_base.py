@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from torchrl_drbpn.functional.gaussian import zero_missing
 
@@ -134,14 +134,27 @@ def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transfor
 
 
 # ------------------------------------------------------------------------------------------ order
+def environment_of(transform: Transform) -> EnvBase | None:
+    """Return the environment that holds the transform, if any does."""
+    try:
+        env: EnvBase | None = transform.container
+    except ValueError:  # inside a Compose that belongs to no environment
+        return None
+    return env
+
+
 def transforms_before(transform: Transform) -> Iterator[Transform]:
     """Yield the transforms that work before `transform`, in its environment and those inside it.
 
     Transforms inside the workers of a batched environment can't be seen.
     """
-    env = transform.parent
+    env = environment_of(transform)
     while isinstance(env, TransformedEnv):
-        yield from (part for part in env.transform.modules() if isinstance(part, Transform))
+        for part in env.transform.modules():
+            if part is transform:
+                break
+            if isinstance(part, Transform):
+                yield part
         env = env.base_env
 
 
@@ -163,11 +176,7 @@ class EnvironmentTransform(Transform):
         )
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        try:
-            env = self.container
-        except ValueError:  # inside a Compose that belongs to no environment
-            env = None
-        if env is None:
+        if environment_of(self) is None:
             raise self._refuse()
         return tensordict
 

@@ -45,15 +45,17 @@ if hasattr(os, "register_at_fork"):
 
 
 def _separate_worker() -> None:
-    """Move the inherited global generator on by the name of the process, once.
+    """Move a global generator that is a copy of the parent's on by the name of the process, once.
 
-    `torch.manual_seed` in the process, as by `ParallelEnv.set_seed`, has the last word: before this
-    it makes it superfluous, after this it undoes it.
+    The one place where the library touches it other than by drawing. `torch.manual_seed` in the
+    process, as by `ParallelEnv.set_seed`, has the last word: before this it makes it superfluous,
+    after this it undoes it.
     """
     global _inherited
     if _inherited is not None and torch.initial_seed() == _inherited:
-        name = multiprocessing.current_process().name.encode()
-        torch.manual_seed(int(torch.randint(1 << _SEED_BITS - 1, ())) ^ zlib.crc32(name))
+        name = zlib.crc32(multiprocessing.current_process().name.encode())
+        moved = torch.Generator().manual_seed(int(torch.randint(1 << 62, ())) ^ name)
+        torch.set_rng_state(moved.get_state())
     _inherited = None
 
 

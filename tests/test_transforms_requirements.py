@@ -1,0 +1,448 @@
+"""What every transform must do, each requirement once for all of them.
+
+TorchRL's own list for a transform (single, serial-trans, parallel-trans, trans-serial,
+trans-parallel, no env, compose, env, model, replay buffer, inverse), and on top: any leading batch
+shape, thousands of rows, float64 kept, meta device, the first observation of an episode treated
+like every other, partial resets that leave the other rows alone, a state that survives `torch.save`
+with `weights_only=True`, copies without a parent, one clear line for what is not an observation.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from contracts import ACTION, OBS, StaircaseEnv, gym_env, parallel_env, saved, with_transform
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, SerialEnv, Transform, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_drbpn.transforms import (
+    FillLastObserved,
+    ObservationMissingness,
+    ObservationNoise,
+    ObservationSpikes,
+    ObservedFromNaN,
+    PreviousAction,
+    SensorOutages,
+    SensorReduction,
+)
+
+COMPLETE = "complete_observation"
+Check = Callable[[TensorDictBase, TensorDictBase], None]
+
+
+# --------------------------------------------------------------------- what each makes of its input
+def masked(before: TensorDictBase, after: TensorDictBase) -> None:
+    """What is missing is 0 and False in the mask, the rest is what came."""
+    observation, observed = after["observation"], after["observed"]
+    assert observed.dtype == torch.bool
+    assert observed.shape == observation.shape
+    if COMPLETE in after:
+        assert torch.equal(observation, after[COMPLETE].where(observed, 0.0))
+        if "observation" in before:
+            assert torch.equal(after[COMPLETE], before["observation"])
+
+
+def reduced(before: TensorDictBase, after: TensorDictBase) -> None:
+    masked(before, after)
+    assert not after["observed"][..., [0, -1]].any()
+    assert after["observed"][..., 1:-1].all()
+
+
+def from_nan(before: TensorDictBase, after: TensorDictBase) -> None:
+    masked(before, after)
+    if "observation" in before:
+        assert torch.equal(after["observed"], ~before["observation"].isnan())
+
+
+def noisy(before: TensorDictBase, after: TensorDictBase) -> None:
+    noise = after["observation"] - after[COMPLETE]
+    assert "observed" not in after
+    assert (noise != 0).all()
+    assert (noise.abs() < 1).all()
+    if "observation" in before:
+        assert torch.equal(after[COMPLETE], before["observation"])
+
+
+def spiked(before: TensorDictBase, after: TensorDictBase) -> None:
+    assert "observed" not in after
+    assert torch.equal(after["observation"] == after[COMPLETE], ~after["spiked"])
+    if "observation" in before:
+        assert torch.equal(after[COMPLETE], before["observation"])
+
+
+def grouped(before: TensorDictBase, after: TensorDictBase) -> None:
+    masked(before, after)
+    on, observed = after["sensor_on"], after["observed"]
+    assert on.shape[-1] == 2
+    assert torch.equal(observed[..., [0, 1]], on[..., :1].expand(*on.shape[:-1], 2))
+    assert torch.equal(observed[..., -1], on[..., 1])
+    assert observed[..., 2:-1].all()
+
+
+def filled(before: TensorDictBase, after: TensorDictBase) -> None:
+    values, observed = after["observation"], after["observed"]
+    assert torch.equal(values, after["last_observation"])
+    if "observation" in before:
+        assert torch.equal(values[observed], before["observation"][observed])
+
+
+def previous(before: TensorDictBase, after: TensorDictBase) -> None:
+    del before
+    assert after["previous_action"].shape[:-1] == after.batch_size
+    assert after["previous_action"].isfinite().all()
+
+
+@dataclass
+class Case:
+    """A transform and what it makes of an observation.
+
+    Attributes:
+        make: returns the transform; with a seed where it takes one.
+        check: asserts that `after` is what the transform makes of `before`, which is empty where
+            what came from the simulator is not known.
+        offline: whether the transform works on a replay buffer.
+        nan: whether it is made for NaN.
+        needs: transforms that stand before it.
+        keys: what must be float64 where the observation is.
+    """
+
+    make: Callable[..., Transform]
+    check: Check
+    offline: bool = False
+    nan: bool = False
+    needs: list[Callable[..., Transform]] = field(default_factory=list)
+    keys: tuple[str, ...] = ("observation",)
+
+    def data(self, batch: tuple[int, ...], dtype: torch.dtype = torch.float32) -> TensorDict:
+        """Return what an environment's step would give to the transform."""
+        generator = torch.Generator().manual_seed(1)
+        made = torch.randn(*batch, OBS, generator=generator, dtype=dtype)
+        data = TensorDict({"observation": made}, batch)
+        if self.nan:
+            made[..., 1] = math.nan
+        if self.needs:
+            data["observed"] = torch.rand(made.shape, generator=generator) < 0.5
+            data["observation"] = made.where(data["observed"], 0.0)
+        return data
+
+    def root(self, batch: tuple[int, ...], dtype: torch.dtype = torch.float32) -> TensorDict:
+        """Return the data at the step before, with the action that led to `data`."""
+        data = self.data(batch, dtype)
+        data["action"] = torch.full((*batch, ACTION), 0.5, dtype=dtype)
+        reset = data.clone()
+        if "previous_action" in self.keys:
+            return reset
+        return self.make()._reset(data.empty(), reset)
+
+    def env(self, base: Any) -> TransformedEnv:
+        return TransformedEnv(base, Compose(*(make() for make in self.needs), self.make()))
+
+
+mcar = partial(ObservationMissingness, "mcar", 0.5, seed=0)
+CASES = {
+    "mcar": Case(partial(mcar, complete_key=COMPLETE), masked, keys=("observation", COMPLETE)),
+    "mar": Case(partial(ObservationMissingness, "mar", 0.7, seed=0, complete_key=COMPLETE), masked),
+    "nmar": Case(
+        partial(ObservationMissingness, "nmar", 0.7, seed=0, complete_key=COMPLETE), masked
+    ),
+    "reduction": Case(
+        partial(SensorReduction, [0, -1], complete_key=COMPLETE), reduced, offline=True
+    ),
+    "nan": Case(ObservedFromNaN, from_nan, offline=True, nan=True),
+    "noise": Case(
+        partial(ObservationNoise, 0.1, seed=0, complete_key=COMPLETE),
+        noisy,
+        keys=("observation", COMPLETE),
+    ),
+    "spikes": Case(
+        partial(ObservationSpikes, 0.3, 50.0, seed=0, complete_key=COMPLETE, spiked_key="spiked"),
+        spiked,
+    ),
+    "outages": Case(partial(SensorOutages, 0.5, 5, seed=0, complete_key=COMPLETE), masked),
+    "groups": Case(
+        partial(
+            SensorOutages,
+            0.4,
+            3,
+            groups=[[0, 1], [-1]],
+            initial="on",
+            seed=0,
+            complete_key=COMPLETE,
+        ),
+        grouped,
+    ),
+    "fill": Case(FillLastObserved, filled, needs=[mcar]),
+    "previous_action": Case(PreviousAction, previous, keys=("previous_action",)),
+}
+every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+of_observations = pytest.mark.parametrize(
+    "case",
+    [case for case in CASES.values() if "previous_action" not in case.keys],
+    ids=[name for name in CASES if name != "previous_action"],
+)
+
+
+def same(first: TensorDictBase, second: TensorDictBase) -> None:
+    assert set(first.keys(True, True)) == set(second.keys(True, True))
+    for key in first.keys(True, True):
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=0, equal_nan=True)
+
+
+def simulator() -> TransformedEnv:
+    return gym_env("InvertedPendulum-v5")
+
+
+def corrupted_simulator(case: Case) -> TransformedEnv:
+    env = simulator()
+    for make in (*case.needs, case.make):
+        env = with_transform(lambda env=env: env, make)
+    return env
+
+
+# ----------------------------------------------------------------------------------- TorchRL's list
+@every
+@pytest.mark.parametrize("batched", [False, True])
+def test_specs_are_met_in_one_environment(case: Case, batched: bool) -> None:
+    env = case.env(StaircaseEnv()) if batched else corrupted_simulator(case)
+    check_env_specs(env, break_when_any_done="both")
+    reset = env.reset()
+    stepped = env.rand_step(reset)["next"]
+    for data in (reset, stepped):
+        case.check(TensorDict(), data)
+        assert env.full_observation_spec.is_in(
+            data.select(*env.full_observation_spec.keys(True, True))
+        )
+
+
+@every
+@pytest.mark.parametrize("where", ["inside", "outside"])
+def test_specs_are_met_with_a_serial_environment(case: Case, where: str) -> None:
+    if where == "inside":
+        env = SerialEnv(2, partial(corrupted_simulator, case))
+    else:
+        env = case.env(SerialEnv(2, simulator))
+    check_env_specs(env)
+    env.close()
+
+
+@every
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["inside", "outside"])
+def test_specs_are_met_with_a_parallel_environment(case: Case, where: str) -> None:
+    if where == "inside":
+        env = parallel_env(2, partial(corrupted_simulator, case))
+    else:
+        env = case.env(parallel_env(2, simulator))
+    try:
+        check_env_specs(env)
+    finally:
+        env.close(raise_if_closed=False)
+
+
+@every
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3), (4096,)], ids=str)
+def test_any_number_of_rows_is_treated_at_once(case: Case, batch: tuple[int, ...]) -> None:
+    data = case.data(batch)
+    if "previous_action" not in case.keys:
+        first = case.make()._reset(data.empty(), data.clone())
+        assert first.batch_size == data.batch_size
+        case.check(data, first)
+    after = case.make()._step(case.root(batch), data.clone())
+    assert after.batch_size == data.batch_size
+    case.check(data, after)
+    composed = Compose(Compose(case.make()))._step(case.root(batch), data.clone())
+    same(after, composed)
+
+
+@every
+def test_the_state_of_the_next_step_needs_no_number_of_this_one(case: Case) -> None:
+    # the meta device has shapes and dtypes, and raises where a value is asked for
+    data, root = (part.to("meta") for part in (case.data((3,)), case.root((3,))))
+    expected = case.make()._step(case.root((3,)), case.data((3,)))
+    after = case.make()._step(root, data)
+    for key, value in expected.items(True, True):
+        assert after[key].device.type == "meta"
+        assert (after[key].shape, after[key].dtype) == (value.shape, value.dtype)
+
+
+@every
+def test_a_replay_buffer_is_served_or_refused_with_nothing_left_in_it(case: Case) -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=4)
+    transform, data = case.make(), case.data((6,)).set("action", torch.zeros(6, ACTION))
+    buffer.append_transform(transform)
+    keys, name = set(data.keys()), type(transform).__name__
+    if case.offline:
+        buffer.extend(data)
+        sample = buffer.sample()
+        case.check(data[sample["index"]], sample)
+        return
+    for use in (buffer.extend, lambda data: buffer.add(data[0])):
+        with pytest.raises(NotImplementedError, match=f"`{name}` .* replay buffer"):
+            use(data)
+    assert len(buffer) == 0
+    assert set(data.keys()) == keys
+
+
+@every
+def test_in_front_of_a_model_it_works_or_is_refused(case: Case) -> None:
+    module = TensorDictModule(nn.Linear(OBS, 1), ["observation"], ["value"])
+    data, transform = case.data((3,)), case.make()
+    if not case.offline:
+        with pytest.raises(NotImplementedError, match=f"`{type(transform).__name__}`"):
+            nn.Sequential(transform, module)(data)
+        return
+    after = nn.Sequential(transform, module)(data.clone())
+    case.check(data, after)
+    same(transform.inv(data), data)
+
+
+@pytest.mark.parametrize("name", ["reduction", "nan"])
+def test_keys_under_next_are_a_vector_of_their_own(name: str) -> None:
+    case = CASES[name]
+    more = {} if name == "nan" else {"complete_key": [COMPLETE, ("next", COMPLETE)]}
+    transform = case.make(in_keys=["observation", ("next", "observation")], **more)
+    data = case.data((4,)).set("next", case.data((4,)))
+    after = transform(data.clone())
+    case.check(data, after)
+    case.check(data["next"], after["next"])
+
+
+# ----------------------------------------------------------------------------- the rest of the list
+@every
+def test_float64_is_kept(case: Case) -> None:
+    after = case.make()._step(case.root((3,), torch.float64), case.data((3,), torch.float64))
+    for key in case.keys:
+        assert after[key].dtype == torch.float64
+
+
+@every
+@pytest.mark.parametrize("batch", [3, 4096])
+def test_a_partial_reset_leaves_the_other_rows_alone(case: Case, batch: int) -> None:
+    env = case.env(StaircaseEnv(batch=batch, dtype=torch.float64))
+    root = env.rand_step(env.reset())["next"].exclude("reward")
+    rows = torch.arange(batch) % 2 == 0
+    after = env.reset(root.clone().set("_reset", rows[:, None]))
+    for key in env.full_observation_spec.keys(True, True):
+        assert torch.equal(after[key][~rows], root[key][~rows]), key
+    case.check(TensorDict(), after)
+
+
+@every
+def test_rollouts_pass_over_the_ends_of_episodes(case: Case) -> None:
+    env = case.env(StaircaseEnv())
+    data = env.rollout(12, break_when_any_done=False)
+    assert data["next", "done"].any()
+    # what the policy reads at t + 1 is what arrived at t, except where an episode began
+    going_on = ~data["next", "done"][:, :-1, 0]
+    for key in env.full_observation_spec.keys(True, True):
+        assert torch.equal(data[key][:, 1:][going_on], data["next", key][:, :-1][going_on]), key
+
+
+@every
+def test_a_saved_state_goes_on_as_if_never_stopped(case: Case) -> None:
+    data, root = case.data((3,)), case.root((3,))
+    first, second = case.make(), case.make()
+    first._step(root, data.clone())
+    second.load_state_dict(saved(first.state_dict()))
+    same(first._step(root, data.clone()), second._step(root, data.clone()))
+
+
+@every
+@pytest.mark.parametrize(
+    "duplicate",
+    [lambda t: t.clone(), copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))],
+    ids=["clone", "deepcopy", "pickle"],
+)
+def test_a_copy_goes_its_own_way_from_the_same_state(case: Case, duplicate: Any) -> None:
+    data, root = case.data((3,)), case.root((3,))
+    first = case.make()
+    first._step(root, data.clone())
+    second = duplicate(first)
+    assert second.container is None
+    # stepping the copy first must not advance the original
+    received = second._step(root, data.clone())
+    same(received, first._step(root, data.clone()))
+
+
+@every
+def test_with_a_seed_the_global_generator_is_neither_read_nor_advanced(case: Case) -> None:
+    data, root, results = case.data((3,)), case.root((3,)), []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        state = torch.get_rng_state()
+        results.append(case.make()._step(root, data.clone()))
+        assert torch.equal(torch.get_rng_state(), state)
+    same(*results)
+
+
+# ----------------------------------------------------------------------- what is not an observation
+@of_observations
+def test_an_absent_observation_is_named(case: Case) -> None:
+    transform = case.make()
+    with pytest.raises(KeyError, match=rf"`{type(transform).__name__}` reads 'observation', which"):
+        transform._step(case.root((3,)), TensorDict({}, [3]))
+    env = TransformedEnv(StaircaseEnv(), case.make(in_keys="state"))
+    with pytest.raises(KeyError, match=r"reads 'state', which is not among .*'observation'"):
+        env.reset()
+
+
+@of_observations
+@pytest.mark.parametrize("change", [lambda x: x.long(), lambda x: x > 0], ids=["integer", "bool"])
+def test_an_observation_that_is_not_floating_point_is_refused(case: Case, change: Any) -> None:
+    data = case.data((3,))
+    data["observation"] = change(data["observation"])
+    with pytest.raises(ValueError, match="`observation` must be a vector of floating"):
+        case.make()._step(case.root((3,)), data)
+
+
+@of_observations
+@pytest.mark.parametrize(
+    "mask", [torch.ones(4, 1, dtype=torch.bool), torch.ones(4, OBS)], ids=["shape", "dtype"]
+)
+def test_a_mask_of_wrong_shape_or_dtype_is_refused(case: Case, mask: torch.Tensor) -> None:
+    data = case.data((4,)).set("observed", mask)
+    with pytest.raises(ValueError, match=r"`observed` must be bool of shape .* = \(4, 5\)"):
+        case.make()._step(case.root((4,)), data)
+
+
+@of_observations
+def test_what_lies_under_a_false_mask_is_never_read(case: Case) -> None:
+    results = []
+    for junk in (0.0, math.nan, math.inf, 1e30):
+        data = case.data((4,))
+        hidden = torch.zeros(4, OBS, dtype=torch.bool)
+        hidden[:, 2] = True
+        data["observed"] = ~hidden
+        data["observation"][:, 2] = junk
+        root = case.root((4,))
+        results.append(case.make()._step(root, data).exclude(COMPLETE))
+        assert not results[-1]["observed"][:, 2].any()
+        assert results[-1]["observation"].isfinite().all()
+        same(results[0], results[-1])
+
+
+@every
+def test_keys_must_come_in_pairs(case: Case) -> None:
+    if "previous_action" in case.keys:
+        with pytest.raises(ValueError, match="`out_keys` must name one key of its own"):
+            case.make("action", ["a", "b"])
+        return
+    with pytest.raises(ValueError, match="`mask_keys` must name one key of its own for each"):
+        case.make(in_keys=["a", "b"])
+    with pytest.raises(TypeError, match="a key must be a string"):
+        case.make(in_keys=[3])
+    nested = case.make(in_keys=[["agents", "observation"]])  # as configurations write it
+    assert nested.in_keys == [("agents", "observation")]
+    assert nested.mask_keys == [("agents", "observed")]
