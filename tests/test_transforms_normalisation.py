@@ -172,7 +172,7 @@ def test_each_observation_is_scaled_by_what_was_seen_up_to_it():
 
 def test_of_masked_observations_only_the_observed_entries_count():
     env = RandomEnv()
-    chain = Compose(ObservationMissingness("mcar", 0.6), MaskedObservationNorm())
+    chain = Compose(ObservationMissingness("mcar", 0.6, seed=0), MaskedObservationNorm())
     env = TransformedEnv(env, chain)
     data = env.rollout(30, break_when_any_done=False)
     # all first observations, and every "next" one: those are all that were sent
@@ -181,7 +181,7 @@ def test_of_masked_observations_only_the_observed_entries_count():
     observed = torch.cat([data["observed"][first], data["next", "observed"].reshape(-1, OBS)])
     assert torch.equal(chain[1].moments[0].count, observed.double().sum(0))
     # the same masks over the same simulator, without the normaliser: what it must have seen
-    plain = TransformedEnv(RandomEnv(), ObservationMissingness("mcar", 0.6))
+    plain = TransformedEnv(RandomEnv(), ObservationMissingness("mcar", 0.6, seed=0))
     raw = plain.rollout(30, break_when_any_done=False)
     value = torch.cat([raw["observation"][first], raw["next", "observation"].reshape(-1, OBS)])
     for i in range(OBS):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import torch
@@ -40,12 +39,13 @@ class FillLastObserved(EnvironmentTransform):
 
     Keyword Args:
         fill_value: what stands in for an entry never observed in this episode, in the units that
-            the observation has at this place of the chain.
+            the observation has at this place of the chain; NaN marks it for
+            `MaskedObservationNorm(missing="keep")`.
         state_keys: where the last values are kept, in the observation spec and the state spec.
             Default `last_<name>` beside each observation.
 
     Raises:
-        ValueError: numbers of keys that do not match, `fill_value` not finite, or, when the
+        ValueError: numbers of keys that do not match, or, when the
             environment is asked for its specs, missingness stands after the transform.
 
     Examples:
@@ -82,8 +82,6 @@ class FillLastObserved(EnvironmentTransform):
             ]
         self.state_keys = pair_keys(inputs, state_keys, name="state_keys", default="")
         self.fill_value = float(fill_value)
-        if not math.isfinite(self.fill_value):
-            raise ValueError(f"`fill_value` must be a finite number, got {fill_value!r}.")
         self._keys = list(
             zip(self.in_keys, self.mask_keys, self.out_keys, self.state_keys, strict=True)
         )
