@@ -1,76 +1,35 @@
-"""What does collection cost beside the bare simulators?
+"""What does collection cost beside the bare simulators, and which backend steps fastest?
 
-All candidates step 16 environments of one task through the same backend in one run: Gymnasium's
-own SyncVectorEnv, GymnasiumBatchEnv by itself, then TorchRL's Collector over it with random
-actions, with random actions and the recipe's transforms, with policy and transforms. Random actions
-are drawn ahead of the clock for all of them; one more line shows what TorchRL's RandomPolicy, which
-draws at every step, adds. The share is frames per second over SyncVectorEnv's: 1 is "collecting
-costs nothing".
+All candidates step as many environments of one task in one run: Gymnasium's own SyncVectorEnv and
+bare EnvPool, the package's batches by themselves with 1 and 2 threads, then TorchRL's Collector
+over GymnasiumBatchEnv: random actions without transforms, with TorchRL's three, with the recipe's,
+and the recipe's policy. Random actions are drawn ahead of the clock. A time of 1 over SyncVectorEnv
+is "collecting costs nothing".
 """
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Callable
 from itertools import cycle
+from typing import Any
 
 import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode
-from recipe import assemble, settings_of
+from interleaved import measure, recipe, show, start
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from timing import CLOCKS, finish, interleave, parser, start, table, verdict
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter, TransformedEnv
-from torchrl.modules import RandomPolicy
+from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, TransformedEnv
 
-from torchrl_drbpn import GymnasiumBatchEnv
+from torchrl_drbpn import EnvPoolBatchEnv, GymnasiumBatchEnv
 
-BARE = "gymnasium SyncVectorEnv"
-TARGETS = {
-    "collector, random, transforms": (0.75, 0.85),
-    "collector, policy, transforms": (0.50, 0.65),
-}
-
-
-def make_collector(env: TransformedEnv, policy: object, frames: int) -> Collector:
-    """Build a collector as the recipe does."""
-    return Collector(
-        env,
-        policy,
-        frames_per_batch=frames,
-        total_frames=-1,
-        track_traj_ids=False,
-        use_buffers=True,
-        auto_register_policy_transforms=False,
-    )
-
-
-class Bare:
-    """Gymnasium's vector environment under random actions drawn ahead.
-
-    It resets within the step that ends an episode, as the others here do: by its default the next
-    call would reset and not step, and fewer than all of its frames would be steps.
-    """
-
-    def __init__(self, env_id: str, num_envs: int, steps: int) -> None:
-        self.envs = gymnasium.make_vec(
-            env_id,
-            num_envs,
-            vectorization_mode="sync",
-            vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-        )
-        self.envs.reset(seed=0)
-        self.envs.action_space.seed(0)
-        self.actions = [self.envs.action_space.sample() for _ in range(steps)]
-
-    def __call__(self) -> None:
-        """Step through one rollout; finished episodes begin again by themselves."""
-        for action in self.actions:
-            self.envs.step(action)
+BARE = "SyncVectorEnv"
 
 
 class DrawnAhead(TensorDictModuleBase):
-    """Random actions drawn ahead, as the bare environment has them."""
+    """Random actions drawn ahead, as the bare environments have them."""
 
     def __init__(self, env: EnvBase, steps: int) -> None:
         super().__init__()
@@ -82,90 +41,78 @@ class DrawnAhead(TensorDictModuleBase):
         return tensordict.set("action", next(self.actions))
 
 
-class BareBatch:
-    """GymnasiumBatchEnv by itself, stepped and reset as TorchRL does."""
+def bare(env: Any, actions: list[Any]) -> Callable[[], None]:
+    """Step a vector environment that begins finished episodes by itself, nothing around it."""
+    env.reset()
 
-    def __init__(self, env_id: str, num_envs: int, steps: int) -> None:
-        self.env = GymnasiumBatchEnv(env_id, num_envs, seed=0)
-        self.root = self.env.reset()
-        self.actions = [self.env.full_action_spec.rand()["action"] for _ in range(steps)]
+    def rollout() -> None:
+        for action in actions:
+            env.step(action)
 
-    @torch.no_grad()
-    def __call__(self) -> None:
-        """Step through one rollout."""
-        root = self.root
-        for action in self.actions:
-            root.set("action", action)
-            _, root = self.env.step_and_maybe_reset(root)
-        self.root = root
+    return rollout
+
+
+def alone(env: EnvBase, steps: int) -> Callable[[], None]:
+    """Step and reset a batch as TorchRL does, without a collector."""
+    policy, state = DrawnAhead(env, steps), {"root": env.reset()}
+
+    def rollout() -> None:
+        for _ in range(steps):
+            _, state["root"] = env.step_and_maybe_reset(policy(state["root"]))
+
+    return rollout
+
+
+def collected(env: EnvBase, steps: int) -> Callable[[], object]:
+    """Collect with random actions as the recipe does with its policy."""
+    collector = Collector(
+        env,
+        DrawnAhead(env, steps),
+        frames_per_batch=env.batch_size[0] * steps,
+        total_frames=-1,
+        track_traj_ids=False,
+        use_buffers=True,
+        auto_register_policy_transforms=False,
+    )
+    return collector.rollout
 
 
 def main() -> None:
     """Run from the command line."""
-    args = parser(__doc__ or "")
-    args.add_argument("--env", default="walker2d", help="an entry of conf/env")
-    args.add_argument("--num-envs", type=int, default=16)
-    args = args.parse_args()
-    run = start(args)
-    num_envs, steps = (2, 16) if args.quick else (args.num_envs, 128)
-    rounds = args.rounds or (2 if args.quick else 9)
-    overrides = [
-        f"env={args.env}",
-        f"collector.num_envs={num_envs}",
-        f"collector.steps_per_env={steps}",
-        "optim.minibatches=1",
-    ]
-    settings = settings_of(*overrides)
-    env_id, frames = settings.env.env_id, num_envs * steps
+    args = start(__doc__ or "", env="walker2d", num_envs=[16, 64], env_threads=[1, 2])
+    for n in [2] if args.quick else args.num_envs:
+        steps = 16 if args.quick else 2048 // n
+        sizes = (f"collector.num_envs={n}", f"collector.steps_per_env={steps}")
+        parts = [recipe(f"env={args.env}", *sizes, "optim.minibatches=1") for _ in range(2)]
+        (trained, settings), (drawn, _) = parts
+        env_id = settings.env.env_id
+        plain = [GymnasiumBatchEnv(env_id, n, seed=0) for _ in range(2)]
+        actions = [plain[0].action_spec.rand().double().numpy() for _ in range(steps)]
+        kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        vector = gymnasium.make_vec(env_id, n, vectorization_mode="sync", vector_kwargs=kwargs)
+        candidates: dict[str, Callable[[], object]] = {BARE: bare(vector, actions)}
+        with_envpool = importlib.util.find_spec("envpool") is not None
+        for threads in args.env_threads:
+            backends = [GymnasiumBatchEnv, EnvPoolBatchEnv] if with_envpool else [GymnasiumBatchEnv]
+            for cls in backends:
+                env = cls(env_id, n, seed=0, num_threads=threads)
+                candidates[f"{cls.__name__}, {threads} threads"] = alone(env, steps)
+            if with_envpool:
+                import envpool
 
-    trained = assemble(settings)
-    few = TransformedEnv(GymnasiumBatchEnv(env_id, num_envs, seed=0))
-    for transform in (RewardSum(), StepCounter(), InitTracker()):
-        few.append_transform(transform)
-    random = {
-        "collector, random, no transform": GymnasiumBatchEnv(env_id, num_envs, seed=0),
-        "collector, random, TorchRL's three": few,
-        "collector, random, transforms": assemble(settings).env,
-    }
-    collectors = {
-        name: make_collector(env, DrawnAhead(env, steps), frames) for name, env in random.items()
-    }
-    drawing = assemble(settings).env
-    collectors["collector, RandomPolicy, transforms"] = make_collector(
-        drawing, RandomPolicy(drawing.full_action_spec), frames
-    )
-    collectors["collector, policy, transforms"] = trained.collector
-    candidates = {
-        BARE: Bare(env_id, num_envs, steps),
-        "GymnasiumBatchEnv": BareBatch(env_id, num_envs, steps),
-    } | {name: collector.rollout for name, collector in collectors.items()}
-    times = interleave(candidates, rounds=rounds, warmup=1, clock=CLOCKS[args.clock])
-    shares = {name: 1 / times.ratio(name, BARE) for name in times.seconds}
-    rows = [
-        (
-            name,
-            frames / times.median(name),
-            times.percent(name),
-            1e6 * times.median(name) / steps,
-            shares[name],
-            1 / times.ratio(name, "GymnasiumBatchEnv"),
-        )
-        for name in times.seconds
-    ]
-    table(
-        f"{env_id}, {num_envs} environments, {frames} frames",
-        ("", "frames/s", "+-", "us/step", f"share of {BARE}", "of GymnasiumBatchEnv"),
-        rows,
-    )
-    for name, (must, aim) in TARGETS.items():
-        print(verdict(name, shares[name], must, aim, quick=args.quick))
-    for collector in collectors.values():
-        collector.shutdown()
-    results = {
-        name: {"frames_per_second": frames / times.median(name), "share": shares[name]}
-        for name in times.seconds
-    }
-    finish(args, run, results)
+                pool = envpool.make_gymnasium(env_id, num_envs=n, num_threads=threads, seed=0)
+                candidates[f"bare EnvPool, {threads} threads"] = bare(pool, actions)
+        three = TransformedEnv(plain[1], Compose(RewardSum(), StepCounter(), InitTracker()))
+        candidates |= {
+            "collector, random": collected(plain[0], steps),
+            "collector, random, TorchRL's three": collected(three, steps),
+            "collector, random, recipe's transforms": collected(drawn.env, steps),
+            "collector, policy": trained.collector.rollout,
+        }
+        with torch.no_grad():
+            seconds = measure(candidates, args)
+        title = f"{env_id}, {n} environments x {steps} steps"
+        show(title, seconds, BARE, args, **{"frames/s": n * steps / seconds.median()})
 
 
 if __name__ == "__main__":

@@ -1,14 +1,15 @@
-"""How fast does the whole recipe train beside what a user could pick instead?
+"""How fast does the recipe train and decide beside what a user could pick instead?
 
-Environment steps per second of complete training rollouts (2048 frames collected, 10 epochs of
-updates) on the same task with the same threads, one rollout of each per round:
+Training: complete rollouts (frames collected, epochs learned) of every candidate in turns:
 
-- ours, defaults (16 environments, 8 minibatches) and experiment=paper (32), corrupted sensors;
-- stable-baselines3 PPO (16 environments, 32 minibatches of 64, networks 2 x 64), clean sensors;
-- sb3-contrib RecurrentPPO (the same with an LSTM of width 64), clean sensors;
+- the recipe with its defaults, with experiment=paper, and with every belief of conf/belief, on
+  corrupted sensors;
+- stable-baselines3's PPO and sb3-contrib's RecurrentPPO (16 environments, minibatches of 64, two
+  layers or an LSTM of width 64), clean sensors;
 - TorchRL's PPO as its MuJoCo example is set (1 environment, 32 minibatches, GAE every epoch).
 
-A peer that is not installed is left out: pip install -e '.[peers]'.
+Decisions: the policies of the beliefs from what one robot, and what all of a batch, sensed. Peers
+that are not installed are left out: pip install -e '.[peers]'.
 """
 
 from __future__ import annotations
@@ -18,160 +19,87 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import pandas as pd
 import torch
-from recipe import assemble, settings_of, train_rollout
+from interleaved import ROOT, measure, recipe, show, start
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-from timing import CLOCKS, finish, interleave, parser, start, table, verdict
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
-from torchrl.envs import (
-    ClipTransform,
-    DoubleToFloat,
-    GymEnv,
-    RewardSum,
-    StepCounter,
-    TransformedEnv,
-    VecNorm,
-)
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import ClipTransform, Compose, DoubleToFloat, GymEnv, TransformedEnv, VecNorm
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import ClipPPOLoss, group_optimizers
+from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-SB3, RECURRENT, TORCHRL = "stable-baselines3 PPO", "sb3-contrib RecurrentPPO", "TorchRL PPO recipe"
-PAPER, DEFAULTS = "ours, experiment=paper", "ours, defaults"
-TARGETS = (
-    (PAPER, SB3, 0.6, 1.0),
-    (PAPER, RECURRENT, 5.0, 10.0),
-    (PAPER, TORCHRL, 4.0, 8.0),
-    (DEFAULTS, SB3, 1.2, 2.0),
-)
+SB3, RECURRENT, TORCHRL = "stable-baselines3 PPO", "sb3-contrib RecurrentPPO", "TorchRL PPO"
+DEFAULTS = "defaults"
 
 
-class Size:
-    """How much every candidate collects and learns in a rollout."""
-
-    def __init__(self, quick: bool) -> None:
-        self.envs, self.steps, self.epochs, self.batch = (
-            (2, 16, 1, 16) if quick else (16, 128, 10, 64)
-        )
-        self.frames = self.envs * self.steps
-
-
-def ours(size: Size, *overrides: str) -> Callable[[], object]:
-    """Make our recipe's rollout and update."""
-    settings = settings_of(
-        *overrides,
-        f"collector.num_envs={size.envs}",
-        f"collector.steps_per_env={size.steps}",
-        f"optim.epochs={size.epochs}",
-    )
-    training = assemble(settings)
-    return lambda: train_rollout(training, settings)
-
-
-def stable_baselines(env_id: str, size: Size, recurrent: bool) -> Callable[[], object]:
-    """Make stable-baselines3's PPO, or RecurrentPPO, on as many environments."""
+def stable_baselines(env_id: str, frames: int, epochs: int, recurrent: bool) -> Callable[[], Any]:
+    """Make stable-baselines3's PPO, or RecurrentPPO, on 16 environments."""
     from stable_baselines3.common.env_util import make_vec_env
 
-    envs = make_vec_env(env_id, n_envs=size.envs, seed=0)
-    kwargs: dict[str, Any] = {
-        "n_steps": size.steps,
-        "batch_size": size.batch,
-        "n_epochs": size.epochs,
-        "seed": 0,
-        "device": "cpu",
-    }
+    n = min(16, frames // 16)
+    kwargs: dict[str, Any] = {"n_steps": frames // n, "batch_size": min(64, frames)}
+    kwargs |= {"n_epochs": epochs, "seed": 0, "device": "cpu"}
+    envs = make_vec_env(env_id, n_envs=n, seed=0)
     if recurrent:
         from sb3_contrib import RecurrentPPO
 
-        policy = {"lstm_hidden_size": 64}
-        model = RecurrentPPO("MlpLstmPolicy", envs, policy_kwargs=policy, **kwargs)
+        lstm = {"lstm_hidden_size": 64}
+        model = RecurrentPPO("MlpLstmPolicy", envs, policy_kwargs=lstm, **kwargs)
     else:
         from stable_baselines3 import PPO
 
         model = PPO("MlpPolicy", envs, **kwargs)
-    return lambda: model.learn(size.frames, reset_num_timesteps=False)
+    return lambda: model.learn(frames, reset_num_timesteps=False)
 
 
 class TorchRLRecipe:
     """PPO from TorchRL's parts with the settings of its MuJoCo example (Schulman et al. 2017)."""
 
-    def __init__(self, env_id: str, size: Size) -> None:
-        env = TransformedEnv(GymEnv(env_id))
-        for transform in (
-            VecNorm(in_keys=["observation"], decay=0.99999, eps=1e-2),
-            ClipTransform(in_keys=["observation"], low=-10, high=10),
-            RewardSum(),
-            StepCounter(),
-            DoubleToFloat(in_keys=["observation"]),
-        ):
-            env.append_transform(transform)
-        obs = env.observation_spec["observation"].shape[-1]
-        spec = env.action_spec_unbatched
+    def __init__(self, env_id: str, frames: int, epochs: int) -> None:
+        norm = VecNorm(in_keys=["observation"], decay=0.99999, eps=1e-2)
+        clip = ClipTransform(in_keys=["observation"], low=-10, high=10)
+        parts = Compose(norm, clip, DoubleToFloat(in_keys=["observation"]))
+        env = TransformedEnv(GymEnv(env_id), parts)
+        obs, spec = env.observation_spec["observation"].shape[-1], env.action_spec_unbatched
         action = spec.shape[-1]
-        policy, value = (
-            MLP(
-                in_features=obs,
-                out_features=out,
-                num_cells=[64, 64],
-                activation_class=torch.nn.Tanh,
-            )
-            for out in (action, 1)
-        )
-        for network, gain in ((policy, 1.0), (value, 0.01)):
-            for layer in network.modules():
-                if isinstance(layer, torch.nn.Linear):
-                    torch.nn.init.orthogonal_(layer.weight, gain)
-                    torch.nn.init.zeros_(layer.bias)
+        cells: dict[str, Any] = {"num_cells": [64, 64], "activation_class": torch.nn.Tanh}
+        policy, value = (MLP(in_features=obs, out_features=n, **cells) for n in (action, 1))
+        scale = AddStateIndependentNormalScale(action, scale_lb=1e-8)
+        network = torch.nn.Sequential(policy, scale)
         actor = ProbabilisticActor(
-            TensorDictModule(
-                torch.nn.Sequential(policy, AddStateIndependentNormalScale(action, scale_lb=1e-8)),
-                in_keys=["observation"],
-                out_keys=["loc", "scale"],
-            ),
+            TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
             in_keys=["loc", "scale"],
             spec=env.full_action_spec_unbatched,
             distribution_class=TanhNormal,
-            distribution_kwargs={
-                "low": spec.space.low,
-                "high": spec.space.high,
-                "tanh_loc": False,
-            },
+            distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
             return_log_prob=True,
         )
         critic = ValueOperator(value, in_keys=["observation"])
-        self.collector = Collector(
-            env,
-            actor,
-            frames_per_batch=size.frames,
-            total_frames=-1,
-            max_frames_per_traj=-1,
-            auto_register_policy_transforms=False,
+        self.batches = iter(
+            Collector(
+                env,
+                actor,
+                frames_per_batch=frames,
+                total_frames=-1,
+                auto_register_policy_transforms=False,
+            )
         )
-        self.batches = iter(self.collector)
         self.buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(size.frames),
+            storage=LazyTensorStorage(frames),
             sampler=SamplerWithoutReplacement(),
-            batch_size=size.batch,
+            batch_size=min(64, frames),
         )
         self.advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic, average_gae=False)
         self.loss = ClipPPOLoss(
-            actor_network=actor,
-            critic_network=critic,
-            clip_epsilon=0.2,
+            actor, critic, entropy_coeff=0.0, critic_coeff=0.25, normalize_advantage=True,
             loss_critic_type="l2",
-            entropy_coeff=0.0,
-            critic_coeff=0.25,
-            normalize_advantage=True,
-        )
-        self.optimizer = group_optimizers(
-            *(
-                torch.optim.Adam(part.parameters(), lr=torch.tensor(3e-4), eps=1e-5)
-                for part in (actor, critic)
-            )
-        )
-        self.epochs = size.epochs
+        )  # fmt: skip
+        parameters = [*actor.parameters(), *critic.parameters()]
+        self.optimizer = torch.optim.Adam(parameters, lr=3e-4, eps=1e-5)
+        self.epochs = epochs
 
     def __call__(self) -> None:
         """Collect one rollout and learn from it."""
@@ -183,56 +111,56 @@ class TorchRLRecipe:
             for batch in self.buffer:
                 self.optimizer.zero_grad(set_to_none=True)
                 out = self.loss(batch)
-                total = out["loss_critic"] + out["loss_objective"] + out["loss_entropy"]
-                total.backward()
+                (out["loss_critic"] + out["loss_objective"] + out["loss_entropy"]).backward()
                 self.optimizer.step()
 
 
 def main() -> None:
     """Run from the command line."""
-    args = parser(__doc__ or "")
-    args.add_argument("--env", default="walker2d", help="an entry of conf/env, version v5")
-    args = args.parse_args()
-    run = start(args)
-    # The example itself uses VecNorm, which TorchRL deprecates.
-    warnings.filterwarnings("ignore", category=FutureWarning)
-    size = Size(args.quick)
-    rounds = args.rounds or (1 if args.quick else 5)
-    common = [f"env={args.env}", "env.version=v5", f"threads={args.threads}"]
-    few = ["optim.minibatches=2"] if args.quick else []
-    env_id = settings_of(*common).env.env_id
-    candidates = {
-        DEFAULTS: ours(size, *common, *few),
-        PAPER: ours(size, "experiment=paper", *common, *few),
-        "ours, belief=none": ours(size, "belief=none", *common, *few),
-    }
-    for name, package, recurrent in (
-        (SB3, "stable_baselines3", False),
-        (RECURRENT, "sb3_contrib", True),
-    ):
+    known = sorted({path.stem for path in (ROOT / "conf/belief").glob("*.yaml")} - {"drbpn"})
+    args = start(__doc__ or "", env="walker2d", beliefs=known)
+    warnings.filterwarnings("ignore", category=FutureWarning)  # VecNorm
+    small = ["collector.num_envs=2", "collector.steps_per_env=16", "optim.epochs=1"]
+    common = [f"env={args.env}", "env.version=v5", *((*small, "optim.minibatches=2") * args.quick)]
+    cases = {DEFAULTS: [], "experiment=paper": ["experiment=paper"]}
+    cases |= {f"belief={name}": [f"belief={name}"] for name in args.beliefs}
+    ours = {name: recipe(*extra, *common) for name, extra in cases.items()}
+    training, settings = ours[DEFAULTS]
+    env_id, frames, epochs = settings.env.env_id, settings.collector.frames, settings.optim.epochs
+    candidates: dict[str, Callable[[], Any]] = {n: train(*parts) for n, parts in ours.items()}
+    for name, package in ((SB3, "stable_baselines3"), (RECURRENT, "sb3_contrib")):
         if importlib.util.find_spec(package) is None:
             print(f"{name} left out: not installed (pip install -e '.[peers]').")
         else:
-            candidates[name] = stable_baselines(env_id, size, recurrent)
-    candidates[TORCHRL] = TorchRLRecipe(env_id, size)
+            candidates[name] = stable_baselines(env_id, frames, epochs, name == RECURRENT)
+    candidates[TORCHRL] = TorchRLRecipe(env_id, frames, epochs)
     torch.set_num_threads(args.threads)  # whatever a peer set at its construction
-    times = interleave(candidates, rounds=rounds, warmup=1, clock=CLOCKS[args.clock])
-    speed = {name: size.frames / times.median(name) for name in times.seconds}
-    ratios = {(a, b): times.ratio(b, a) for a in times.seconds for b in times.seconds}
-    base = SB3 if SB3 in speed else DEFAULTS
-    table(
-        f"{env_id}, {size.frames} frames and {size.epochs} epochs a rollout",
-        ("", "steps/s", "+-", f"x {base}"),
-        [(name, speed[name], times.percent(name), ratios[name, base]) for name in speed],
-    )
-    for name, peer, must, aim in TARGETS:
-        if peer in speed:
-            print(verdict(f"{name} / {peer}", ratios[name, peer], must, aim, quick=args.quick))
-    results = {
-        "steps_per_second": speed,
-        "ratios": {f"{a} / {b}": value for (a, b), value in ratios.items() if a != b},
-    }
-    finish(args, run, results)
+    seconds = measure(candidates, args)
+    learned = {n: sum(x.numel() for x in p.agent.belief.parameters()) for n, (p, _) in ours.items()}
+    show(
+        f"{env_id}, {frames} frames and {epochs} epochs a rollout", seconds, DEFAULTS, args,
+        **{"steps/s": frames / seconds.median(), "parameters of the belief": pd.Series(learned)},
+    )  # fmt: skip
+    # In the middle of a rollout, so that a memory has something in it.
+    middle = {n: p.collector.rollout()[:, 8].clone() for n, (p, _) in ours.items()}
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for rows in (1, training.env.batch_size[0]):
+            policies = {n: decide(p.agent.policy, middle[n][:rows]) for n, (p, _) in ours.items()}
+            seconds = measure(policies, args, calls=200)
+            show(f"a decision, {rows} robots", seconds, DEFAULTS, args)
+
+
+def train(training: Any, settings: Any) -> Callable[[], object]:
+    """Make the call that collects one rollout and learns from it."""
+    from training.loop import train_rollout
+
+    return lambda: train_rollout(training, settings)
+
+
+def decide(policy: Any, row: Any) -> Callable[[], object]:
+    """Make the call that decides from what some robots sensed."""
+    source = row.select(*policy.in_keys, strict=False)
+    return lambda: policy(source.copy())
 
 
 if __name__ == "__main__":

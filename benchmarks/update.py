@@ -1,151 +1,118 @@
-"""Where does the time of one PPO update go?
+"""What does one PPO update cost, and what one decision?
 
-One rollout is collected; then updates on one of its minibatches are timed part by part, for the
-recipe's defaults, for experiment=paper, and for the same agent without a belief (belief=none).
-Parts: filter (both passes of the belief module), heads and loss, the backward pass down to the
-features, the backward pass through the filter, gradient norm and optimiser.
+Update: a rollout is collected; then one of its minibatches is passed through the belief alone, the
+loss, the loss and its backward pass, and the whole gradient step (gradient norm and Adam with it),
+for the defaults, for experiment=paper and for the same agent without a belief.
+
+Decision: from what arrived to the action, for one robot and for 64: the TensorDict policy, the same
+on plain tensors (PolicyStep), exported by torch.export, and compiled ahead of time by AOTInductor
+(needs a C++ compiler; left out by --quick). All give the same action.
 """
 
 from __future__ import annotations
 
-import statistics
+import logging
+import shutil
+import tempfile
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
-from recipe import (
-    PPO,
-    Training,
-    add_advantages,
-    assemble,
-    minibatches,
-    settings_of,
-    to_sequences,
-)
-from tensordict import TensorDictBase
-from timing import CLOCKS, finish, interleave, parser, start, table
+from interleaved import measure, recipe, show, start
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn.functional import FilterOutput, FollowedOutput
+from torchrl_drbpn import PolicyStep
 
-PARTS = (
-    "filter",
-    "heads and loss",
-    "backward, heads and loss",
-    "backward, filter",
-    "optimiser",
-)
+POLICY, WHOLE = "TensorDict policy", "whole step"
 
 
-class Update:
-    """One gradient step, with a clock at the borders of its parts."""
+def update_parts(training: Any, settings: Any) -> tuple[dict[str, Callable[[], Any]], Any]:
+    """Make the calls of one update, each with all that comes before it, and its minibatch."""
+    from training.rollout import add_advantages, minibatches, to_sequences
 
-    def __init__(
-        self,
-        training: Training,
-        ppo: PPO,
-        batch: TensorDictBase,
-        max_norm: float,
-        clock: Callable[[], float],
-    ) -> None:
-        self.ppo, self.batch, self.max_norm, self.clock = ppo, batch, max_norm, clock
-        self.parameters = list(training.agent.parameters())
-        self.rows: list[dict[str, float]] = []
-        self._in_filter = 0.0
-        self._features_done: float | None = None
-        # The loss calls the filter itself where it can; a hook on the module would change that.
-        belief = getattr(training.agent.belief, "filter", training.agent.belief)
-        belief.register_forward_pre_hook(self._enter)
-        belief.register_forward_hook(self._leave)
+    loss, belief = training.algorithm.loss, training.agent.belief
+    data = training.collector.rollout()
+    add_advantages(data, training.agent, training.gae)
+    sequences = to_sequences(data, loss, settings.optim.sequence_length)
+    generator = torch.Generator().manual_seed(0)
+    batch = next(minibatches(sequences, settings.optim.minibatches, generator))
+    parameters = [p for p in training.agent.parameters() if p.requires_grad]
+    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
 
-    def _enter(self, *_: Any) -> None:
-        self._entered = self.clock()
+    def through_belief() -> None:
+        with set_recurrent_mode(True):
+            belief(batch.copy())
 
-    def _leave(self, _module: Any, _inputs: Any, out: Any) -> None:
-        self._in_filter += self.clock() - self._entered
-        plain = isinstance(out, (FilterOutput, FollowedOutput))
-        features = out.mean if plain else out.get("features")
-        whole = features.shape[:2] == self.batch.shape  # not the pass over the last observations
-        if whole and features.requires_grad:
-            # The engine computes this gradient when it has passed loss and heads.
-            features.register_hook(self._mark)
+    def backward() -> None:
+        optimizer.zero_grad()
+        losses = [value for key, value in loss(batch).items() if key.startswith("loss")]
+        torch.autograd.backward(sum(losses))
 
-    def _mark(self, _grad: torch.Tensor) -> None:
-        self._features_done = self.clock()
-
-    def __call__(self) -> None:
-        """Take the step and note its times."""
-        loss, optimizer = self.ppo.loss, self.ppo.optimizer
-        self._in_filter, self._features_done = 0.0, None
-        begin = self.clock()
-        out = loss(self.batch)
-        total = sum(value for key, value in out.items() if key.startswith("loss"))
-        assert isinstance(total, torch.Tensor)
-        forward = self.clock()
-        optimizer.zero_grad(set_to_none=True)
-        torch.autograd.backward(total)
-        backward = self.clock()
-        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_norm)
+    def step() -> None:
+        backward()
+        torch.nn.utils.clip_grad_norm_(parameters, settings.optim.max_grad_norm)
         optimizer.step()
-        end = self.clock()
-        middle = backward if self._features_done is None else self._features_done
-        values = (
-            self._in_filter,
-            forward - begin - self._in_filter,
-            middle - forward,
-            backward - middle,
-            end - backward,
-        )
-        self.rows.append(dict(zip(PARTS, values, strict=True)))
 
-    def median(self, part: str) -> float:
-        """Return the median milliseconds of a part."""
-        return 1e3 * statistics.median(row[part] for row in self.rows)
+    calls = {
+        "belief forward": through_belief,
+        "loss forward": lambda: loss(batch),
+        "loss forward and backward": backward,
+        WHOLE: step,
+    }
+    return calls, batch
+
+
+def decisions(training: Any, rows: int, folder: Path | None) -> dict[str, Callable[[], Any]]:
+    """Make the calls of one decision, checked against each other; AOTInductor with a folder."""
+    agent = training.agent.eval()
+    step = PolicyStep(agent.belief, agent.actor.module[0].module)
+    keys = agent.belief.in_keys
+    row = training.collector.rollout()[:1, 8:9].reshape(-1).expand(rows)
+    inputs = tuple(row.get(key).clone() for key in keys)
+    source = TensorDict(dict(zip(keys, inputs, strict=True)), batch_size=[rows])
+    exported = torch.export.export(step, inputs)
+    plain: dict[str, Callable[..., Any]] = {"PolicyStep": step, "exported": exported.module()}
+    if folder is not None:
+        logging.getLogger("torch._inductor").setLevel(logging.ERROR)
+        path = str(folder / f"policy_{rows}.pt2")
+        package = torch._inductor.aoti_compile_and_package(exported, package_path=path)
+        plain["AOTInductor"] = torch._inductor.aoti_load_package(package)
+    expected = agent.policy(source.copy()).get("action")
+    for call in plain.values():
+        torch.testing.assert_close(call(*inputs)[0], expected, rtol=1e-4, atol=1e-5)
+    calls = {name: lambda call=call: call(*inputs) for name, call in plain.items()}
+    return {POLICY: lambda: agent.policy(source.copy())} | calls
 
 
 def main() -> None:
     """Run from the command line."""
-    args = parser(__doc__ or "")
-    args.add_argument("--env", default="walker2d", help="an entry of conf/env")
-    args = args.parse_args()
-    run = start(args)
-    rounds = args.rounds or (2 if args.quick else 60)
-    size = ["collector.num_envs=2", "collector.steps_per_env=16"] if args.quick else []
-    common = [f"env={args.env}", *size]
-    few = ["optim.minibatches=2"] if args.quick else []
-    cases = {
-        "defaults": [*common, *few],
-        "experiment=paper": ["experiment=paper", "env.version=v5", *common, *few],
-        "belief=none": ["belief=none", *common, *few],
-    }
-    updates = {}
-    titles = {}
-    for name, overrides in cases.items():
-        settings = settings_of(*overrides)
-        training = assemble(settings)
-        data = training.collector.rollout()
-        add_advantages(data, training.agent, training.gae)
-        ppo = training.algorithm
-        assert isinstance(ppo, PPO)
-        sequences = to_sequences(data, ppo.loss, settings.optim.sequence_length)
-        batch = next(minibatches(sequences, settings.optim.minibatches, ppo.generator))
-        updates[name] = Update(
-            training, ppo, batch, settings.optim.max_grad_norm, CLOCKS[args.clock]
-        )
-        titles[name] = (
-            f"{name} ({batch.shape[0]} x {batch.shape[1]} = {batch.numel()} frames a minibatch)"
-        )
-        training.collector.shutdown()
-    times = interleave(updates, rounds=rounds, warmup=3, clock=CLOCKS[args.clock])
-    results = {}
-    for name, update in updates.items():
-        total = 1e3 * times.median(name)
-        rows = [(part, update.median(part), 100 * update.median(part) / total) for part in PARTS]
-        table(titles[name], ("", "ms", "%"), [*rows, ("whole update", total, 100.0)])
-        results[name] = {part: value for part, value, _ in rows} | {"whole": total}
-    print()
-    for name in ("defaults", "experiment=paper"):
-        print(f"{name} / belief=none: {times.ratio(name, 'belief=none'):.2f}")
-    finish(args, run, results)
+    args = start(__doc__ or "", env="walker2d")
+    warnings.filterwarnings("ignore", category=FutureWarning)
+    common = [f"env={args.env}", "env.version=v5"]
+    if args.quick:
+        common += ["collector.num_envs=2", "collector.steps_per_env=16", "optim.minibatches=2"]
+    for name in ("defaults", "experiment=paper", "belief=none"):
+        training, settings = recipe(*([name] * (name != "defaults")), *common)
+        calls, batch = update_parts(training, settings)
+        title = f"update, {name}, minibatch of {batch.shape[0]} x {batch.shape[1]} frames"
+        show(title, measure(calls, args, calls=5), WHOLE, args)
+    compiler = shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        print("AOTInductor left out: no C++ compiler (g++ or clang++) in PATH.")
+    training, _ = recipe(*common)
+    with (
+        torch.no_grad(),
+        set_exploration_type(ExplorationType.DETERMINISTIC),
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        for rows in (1, 64):
+            ahead = Path(folder) if compiler is not None and not args.quick else None
+            calls = decisions(training, rows, ahead)
+            show(f"a decision, {rows} robots", measure(calls, args, calls=200), POLICY, args)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""The benchmarks run, print what they should, and write their numbers whole.
+"""The benchmarks run, print what they should, and write their tables.
 
-Specified here: each file of `benchmarks/` that is a command ends well with --quick, prints versions
-and threads, and writes JSON; the ratio of two candidates comes from pairs of one round; the verdict
-knows targets that want small and targets that want large figures. Speed itself is not tested: a
+Each command of `benchmarks/` ends well with --quick and writes JSON, the calibration example
+runs, and the ratio of two candidates comes from pairs of one round. Speed itself is not tested: a
 test that fails on a loaded machine tells nothing.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -20,72 +20,62 @@ ROOT = Path(__file__).parents[1]
 BENCHMARKS = ROOT / "benchmarks"
 sys.path.append(str(BENCHMARKS))
 
-import timing  # noqa: E402
+import interleaved  # noqa: E402
 
-HELPERS = {"timing.py", "recipe.py"}
+HELPERS = {"interleaved.py", "timing.py"}
 COMMANDS = sorted(p.name for p in BENCHMARKS.glob("*.py") if p.name not in HELPERS)
 
 
-def test_every_question_of_the_performance_page_has_its_file():
-    wanted = {"filter", "decision", "update", "collection", "peers", "growth"}
-    assert wanted <= {Path(name).stem for name in COMMANDS}
-    text = (ROOT / "docs" / "performance.md").read_text()
-    for name in COMMANDS:
-        assert f"benchmarks/{name}" in text, name
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_benchmark_runs_with_quick_and_writes_its_numbers(name, tmp_path):
-    if name == "environments.py":
-        pytest.importorskip("envpool")
-    target = tmp_path / "deep" / "out.json"
+def run(path: Path, folder: Path, *words: str) -> str:
     done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / name), "--quick", "--json", str(target)],
-        cwd=tmp_path,
+        [sys.executable, str(path), "--quick", *words],
+        cwd=folder,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         timeout=300,
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert "torchrl 0." in done.stdout
-    assert "torch threads 1" in done.stdout
-    written = json.loads(target.read_text())
-    assert written["run"]["threads"] == 1
-    assert written["results"]
+    return done.stdout
+
+
+def test_the_performance_page_names_every_command():
+    text = (ROOT / "docs" / "performance.md").read_text()
+    assert {"collection.py", "filter.py", "peers.py", "update.py"} <= set(COMMANDS)
+    for name in COMMANDS:
+        assert f"benchmarks/{name}" in text, name
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_benchmark_runs_with_quick_and_writes_its_tables(name, tmp_path):
+    target = tmp_path / "deep" / "out.json"
+    words = ["--beliefs", "none"] if name == "peers.py" else []
+    out = run(BENCHMARKS / name, tmp_path, "--json", str(target), *words)
+    assert "torchrl 0." in out
+    assert "torch threads 1" in out
+    assert all(json.loads(target.read_text()).values())
     assert [p.name for p in target.parent.iterdir()] == ["out.json"]
     assert [p.name for p in tmp_path.iterdir()] == ["deep"], "leaves nothing else behind"
 
 
-def test_a_ratio_compares_within_a_round():
-    # The machine slows down tenfold after two rounds; a is twice as slow as b in every one.
-    times = timing.Times({"a": [2.0, 2.0, 20.0], "b": [1.0, 1.0, 10.0]})
-    assert times.ratio("a", "b") == 2.0
-    assert times.median("a") == 2.0
+def test_the_calibration_example_runs(tmp_path):
+    out = run(ROOT / "docs" / "calibration" / "constant_covariance.py", tmp_path)
+    assert "MSE, constant over exact" in out
 
 
-def test_every_candidate_is_timed_once_a_round_and_warmed_up_before():
+def test_candidates_are_timed_once_a_round_in_turns_after_a_warm_up():
     calls: list[str] = []
-    times = timing.interleave(
-        {name: lambda name=name: calls.append(name) for name in "abc"}, rounds=3, warmup=1
-    )
+    args = argparse.Namespace(clock="wall", threads=1, rounds=3, quick=True)
+    candidates = {name: lambda name=name: calls.append(name) for name in "abc"}
+    seconds = interleaved.measure(candidates, args)
     assert "".join(calls) == "abc" + "abc" + "bca" + "cab"
-    assert {len(v) for v in times.seconds.values()} == {3}
+    assert seconds.shape == (3, 3)
 
 
-@pytest.mark.parametrize(
-    ("value", "must", "aim", "word"),
-    [
-        (0.9, 2.0, 1.0, "aim reached"),
-        (1.5, 2.0, 1.0, "must reached"),
-        (2.1, 2.0, 1.0, "missed"),
-        (0.9, 0.5, 0.65, "aim reached"),
-        (0.6, 0.5, 0.65, "must reached"),
-        (0.4, 0.5, 0.65, "missed"),
-        (1.0, 1.0, 1.0, "aim reached"),
-        (1.1, 1.0, 1.0, "missed"),
-    ],
-)
-def test_a_verdict_knows_which_direction_is_better(value, must, aim, word):
-    assert word in timing.verdict("x", value, must, aim)
-    assert word not in timing.verdict("x", value, must, aim, quick=True)
+def test_a_ratio_compares_within_a_round(capsys):
+    # The machine slows down tenfold after two rounds; a is twice as slow as b in every one.
+    seconds = interleaved.pd.DataFrame({"a": [2.0, 2.0, 20.0], "b": [1.0, 1.0, 10.0]})
+    args = argparse.Namespace(json=None, tables={})
+    table = interleaved.show("x", seconds, "b", args)
+    assert table.loc["a", "time over b"] == 2.0
+    assert table.loc["a", "ms"] == 2000.0

@@ -27,7 +27,7 @@ from torchrl_drbpn.functional import (
     update,
 )
 
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+sys.path.append(str(Path(__file__).parents[1] / "docs/calibration"))
 
 import constant_covariance
 

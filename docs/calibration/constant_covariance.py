@@ -1,4 +1,4 @@
-"""What does the paper's constant predicted covariance cost, and how honest is it?
+"""What does the paper's constant predicted covariance cost, and how well is it calibrated?
 
 A known linear system, four sensors with noise, and two filters that know everything about it but
 one thing: the exact filter propagates its covariance (P = A Sigma A' + Q), the other predicts with
@@ -8,16 +8,17 @@ filter that is as sure as it should be. Sensors fail one by one, independently a
 20 steps on average, or all at once. Each sensor shows one component of the state, so NEES / n is
 told by the steps since a component was last seen as well, in the classes of diagnose.py: of the
 sub-vector of the components in a class, 0 for those that have just arrived. Plus-minus: 1.96
-standard errors over independent sequences.
+standard errors over independent sequences. ``--quick`` only shows that it runs.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+import sys
 
+import pandas as pd
 import torch
-from timing import finish, parser, start, table
 from torch import Tensor
 
 from torchrl_drbpn.functional import (
@@ -172,15 +173,14 @@ def judge(
     return sums | {"entries": torch.full((rows,), float(STATE * time), dtype=torch.float64)}
 
 
-def ratio(numerator: Tensor, denominator: Tensor) -> tuple[float, float]:
+def ratio(numerator: Tensor, denominator: Tensor) -> str:
     """Return a ratio of sums over sequences and 1.96 standard errors of it."""
     value = numerator.sum() / denominator.sum()
-    rest = numerator - value * denominator
-    error = rest.std() * math.sqrt(len(rest)) / denominator.sum()
-    return value.item(), 1.96 * error.item()
+    error = (numerator - value * denominator).std() * math.sqrt(len(numerator)) / denominator.sum()
+    return f"{value:.2f} +- {1.96 * error:.2f}"
 
 
-def by_class(found: dict[str, Tensor]) -> dict[str, tuple[float, float]]:
+def by_class(found: dict[str, Tensor]) -> dict[str, str]:
     """Return NEES over components of every class that the data holds."""
     nees, count = found["nees by class"], found["components by class"]
     return {
@@ -190,51 +190,34 @@ def by_class(found: dict[str, Tensor]) -> dict[str, tuple[float, float]]:
     }
 
 
-def main() -> None:
-    """Run from the command line."""
-    args = parser(__doc__ or "").parse_args()
-    run = start(args)
-    rows, time, iterations = (8, 20, 3) if args.quick else (200, 200, 200)
+def main(quick: bool = False) -> None:
+    """Print both tables of docs/calibration.md."""
+    rows, time, iterations = (8, 20, 3) if quick else (200, 200, 200)
     model = system()
-    results: dict[str, dict[str, tuple[float, float]]] = {}
-    classes: dict[str, dict[str, dict[str, tuple[float, float]]]] = {}
+    assert isinstance(model.transition_cov, Tensor)
+    averages, classes = {}, {}
     for name, case in CASES.items():
         _, observation, observed = simulate(model, case, rows, time, seed=0)
         cov = trained_cov(model, observation, observed, iterations)
         data = simulate(model, case, rows, time, seed=1)
-        assert isinstance(model.transition_cov, Tensor)
-        exact = judge(model, model.transition_cov, *data, propagated=True)
-        constant = judge(model, cov, *data, propagated=False)
-        # What a P that was trained as the whole covariance gives where it is taken for Q.
-        mistaken = judge(model, cov, *data, propagated=True)
-        results[name] = {
-            "mse": ratio(constant["se"], exact["se"]),
-            "nees constant": ratio(constant["nees"], constant["entries"]),
-            "nees exact": ratio(exact["nees"], exact["entries"]),
-            "nees trained constant, propagated": ratio(mistaken["nees"], mistaken["entries"]),
-            "nis trained constant, propagated": ratio(mistaken["nis"], mistaken["dof"]),
-            "nis constant": ratio(constant["nis"], constant["dof"]),
-            "nis exact": ratio(exact["nis"], exact["dof"]),
+        filters = {
+            "constant": judge(model, cov, *data, propagated=False),
+            "exact": judge(model, model.transition_cov, *data, propagated=True),
+            # What a P that was trained as the whole covariance gives where it is taken for Q.
+            "constant, propagated": judge(model, cov, *data, propagated=True),
         }
-        classes[name] = {"constant": by_class(constant), "exact": by_class(exact)}
-    for title, keys in {
-        "state MSE, constant over exact": ("mse",),
-        "NEES / n": ("nees constant", "nees exact", "nees trained constant, propagated"),
-        "NIS / entries": ("nis constant", "nis exact", "nis trained constant, propagated"),
-    }.items():
-        columns = [c for key in keys for c in (key.partition(" ")[2] or key, "+-")]
-        lines = [
-            (name, *(v for key in keys for v in found[key])) for name, found in results.items()
-        ]
-        table(title, ("sensors fail", *columns), lines)
-    for name, found in classes.items():
-        table(
-            f"NEES / n by steps since last seen, {name}",
-            ("steps", "constant", "+-", "exact", "+-"),
-            [(step, *found["constant"][step], *found["exact"][step]) for step in found["exact"]],
-        )
-    finish(args, run, {"together": results, "by steps since last seen": classes})
+        mse = ratio(filters["constant"]["se"], filters["exact"]["se"])
+        averages[name] = {"MSE, constant over exact": mse} | {
+            f"{what}, {label}": ratio(found[what], found[per])
+            for what, per in (("nees", "entries"), ("nis", "dof"))
+            for label, found in filters.items()
+        }
+        for label in ("constant", "exact"):
+            classes[name, label] = by_class(filters[label])
+    print(pd.DataFrame(averages).to_string())
+    print("\nNEES / n by steps since last seen")
+    print(pd.DataFrame(classes).reindex(class_names()).fillna("").to_string())
 
 
 if __name__ == "__main__":
-    main()
+    main("--quick" in sys.argv)
