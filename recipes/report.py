@@ -17,7 +17,7 @@ import pandas as pd
 from analysis.figures import learning_curves, robustness
 from analysis.page import page
 from analysis.runs import Study, find_folders, read_runs, write_table
-from analysis.tables import aggregate, compare, summarise
+from analysis.tables import derived_tables
 from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.console import say, start
@@ -73,15 +73,10 @@ def _studies(wanted: str | list[str]) -> list[Path]:
 def _write_page(folder: Path, config: dict[str, Any]) -> None:
     """Write all that follows from the tables of a study."""
     study = Study.read(folder)
-    summary = summarise(study)
-    tables = {
-        "summary": summary,
-        "aggregate": aggregate(study, summary),
-        "comparison": compare(study, summary, config["reference"]),
-    }
+    tables = derived_tables(study, config["reference"])
     figures: dict[str, Any] = {"learning_curves.png": learning_curves(study.training)}
     for mode, name in (("sampled", "robustness.png"), ("mean", "robustness_mean_actions.png")):
-        shown = summary[summary["mode"] == mode]
+        shown = tables["summary"][tables["summary"]["mode"] == mode]
         figures[name] = robustness(shown, rows="kind", columns="task")
     for name, table in tables.items():
         _replace(folder / f"{name}.csv", table if len(table) else None)

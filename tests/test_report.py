@@ -23,7 +23,7 @@ from recipe_tools import BELIEFS, ROOT, make_config  # isort: skip
 from analysis.figures import draw_evaluation, episode_summary
 from analysis.runs import missingness_point, over_episodes, read_runs, write_table
 from analysis.statistics import interquartile_mean, interval, probability_of_improvement, ratio
-from analysis.tables import point_kind, point_order
+from analysis.tables import derived_tables, point_kind, point_order
 from report import run
 from training.errors import UserError
 from training.methods import method_name, training_labels
@@ -87,12 +87,15 @@ def report(folders: list[Path] | str, out: Path, **options: Any) -> str:
     return (out / "README.md").read_text()
 
 
-def row(out: Path, point: str, mode: str = "sampled", table: str = "summary", **where: Any) -> Any:
-    rows = pd.read_csv(out / f"{table}.csv", keep_default_na=False, na_values=[""])
+def tables(folders: list[Path], further: str | None = None) -> dict[str, Any]:
+    return derived_tables(read_runs(folders, further), "drbpn")
+
+
+def row(table: Any, point: str, mode: str = "sampled", **where: Any) -> Any:
     for name, value in ({"point": point, "mode": mode} | where).items():
-        rows = rows[rows[name] == value]
-    assert len(rows) == 1, (point, mode, where, rows)
-    return rows.iloc[0]
+        table = table[table[name] == value]
+    assert len(table) == 1, (point, mode, where, table)
+    return table.iloc[0]
 
 
 @pytest.fixture
@@ -177,27 +180,28 @@ def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it() -> None:
 # Tables -----------------------------------------------------------------------------------------
 
 
-def test_means_over_seeds_stand_beside_every_seeds_own_number(
-    seeds: list[Path], tmp_path: Path
-) -> None:
-    page = report(seeds, tmp_path / "out")
-    training = row(tmp_path / "out", "training")
+def test_means_over_seeds_stand_beside_every_seeds_own_number(seeds: list[Path]) -> None:
+    summary = tables(seeds)["summary"]
+    training = row(summary, "training")
     assert (training["return"], training.low, training.high) == (60, 40, 90)
     assert training.per_seed == "0=40 1=50 2=90"
     assert training.missing_ratio == pytest.approx((0.1 + 3 * 0.3) / 4)  # over all rollouts
     assert training.steps_per_second == pytest.approx(4 / (1 / 100 + 3 / 200))
-    assert "**60** [40, 90]" in page
-    assert row(tmp_path / "out", "mar:0.5", "mean")["return"] == 60  # the run's own, at the end
+    assert row(summary, "mar:0.5", "mean")["return"] == 60  # the run's own, at the end
 
 
-def test_episodes_are_summed_up_over_their_steps_and_shares_are_of_means(tmp_path: Path) -> None:
-    points = [{"none:0": (90.0, 110.0), "mcar:0.5": (80.0, 90.0)}, {"none:0": (10.0,), "mcar:0.5": (20.0,)}]  # fmt: skip # noqa: E501
+def test_a_share_is_a_ratio_of_means(tmp_path: Path) -> None:
+    points = [
+        {"none:0": (90.0, 110.0), "mcar:0.5": (85.0,)},
+        {"none:0": (10.0,), "mcar:0.5": (20.0,)},
+    ]
     folders = [make_run(tmp_path / f"s{i}", seed=i, points=p) for i, p in enumerate(points)]
-    page = report(folders, tmp_path / "out")
-    half = row(tmp_path / "out", "mcar:0.5")
+    half = row(tables(folders)["summary"], "mcar:0.5")
     assert half["return"] == (85 + 20) / 2
-    assert half.share == pytest.approx((85 + 20) / (100 + 10), rel=1e-5)  # not (0.85 + 2) / 2
-    assert " 95%" in page
+    assert half.share == pytest.approx((85 + 20) / (100 + 10))  # not (0.85 + 2) / 2
+
+
+def test_episodes_are_summed_up_over_their_steps() -> None:
     table = pd.DataFrame(episodes({"mcar:0.5": (1.0, 2.0)})).assign(missing_ratio=[0.2, 0.6])
     found = over_episodes(table.assign(log_likelihood=[1.0, 2.0], diverged=[0, 1])).iloc[0]
     assert found.missing_ratio == pytest.approx((0.2 * 10 + 0.6 * 30) / 40)
@@ -205,39 +209,31 @@ def test_episodes_are_summed_up_over_their_steps_and_shares_are_of_means(tmp_pat
     assert (found.return_mean, found.diverged, found.episodes) == (1.5, 0.5, 2)
 
 
-def test_a_mean_that_lacks_a_seed_is_not_given(seeds: list[Path], tmp_path: Path) -> None:
+def test_a_mean_that_lacks_a_seed_is_not_given(seeds: list[Path]) -> None:
     (seeds[1] / "robustness.csv").unlink()
-    report(seeds, tmp_path / "out")
-    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
-    assert "mcar:0.5" not in set(summary.point)
-    assert "training" in set(summary.point)
+    points = set(tables(seeds)["summary"].point)
+    assert "mcar:0.5" not in points
+    assert "training" in points
 
 
 def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "a")
     write_table(folder / "points.csv", episodes({"mcar:0.5": (1.0, 1.0), "nmar:0.5": (7.0, 7.0)}))
-    report([folder], tmp_path / "out")
-    assert row(tmp_path / "out", "mcar:0.5")["return"] == 85
-    assert row(tmp_path / "out", "nmar:0.5")["return"] == 7
+    summary = tables([folder])["summary"]
+    assert row(summary, "mcar:0.5")["return"] == 85
+    assert row(summary, "nmar:0.5")["return"] == 7
 
 
 def test_a_table_over_several_runs_is_read_by_their_names(
     seeds: list[Path], tmp_path: Path
 ) -> None:
-    tables = [
+    parts = [
         pd.DataFrame(episodes({"noise:3": (value,)})).assign(run=folder.name)
         for value, folder in zip((1.0, 2.0, 6.0), seeds, strict=True)
     ]
-    write_table(tmp_path / "robust.csv", pd.concat(tables))
-    report(seeds, tmp_path / "out", evaluation=str(tmp_path / "robust.csv"))
-    assert row(tmp_path / "out", "noise:3").per_seed == "0=1 1=2 2=6"
-
-
-def test_episodes_whose_belief_diverged_are_told(seeds: list[Path], tmp_path: Path) -> None:
-    table = pd.DataFrame(episodes({"none:0": (90.0, 110.0), "mcar:0.5": (80.0, 90.0)}))
-    table.loc[2, "diverged"] = 1
-    write_table(seeds[0] / "robustness.csv", table)
-    assert "85% (diverged: 17%)" in report(seeds, tmp_path / "out")  # one of six
+    write_table(tmp_path / "robust.csv", pd.concat(parts))
+    summary = tables(seeds, str(tmp_path / "robust.csv"))["summary"]
+    assert row(summary, "noise:3").per_seed == "0=1 1=2 2=6"
 
 
 def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path: Path) -> None:
@@ -248,36 +244,32 @@ def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path: Path) 
         for i, kind in enumerate(kinds)
         for seed in (0, 1)
     ]
-    page = report(folders, tmp_path / "out")
-    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
+    summary = tables(folders)["summary"]
     training = summary[summary.point == "training"]
     assert sorted(training["return"]) == [10.0 * i for i in range(len(kinds))]
     assert (training.seeds == 2).all()
-    faster = training[training["return"] == 10.0].settings
-    assert faster.tolist() == ["optim.lr=0.1"]
-    assert "| ppo_ours" in page
+    assert training[training["return"] == 10.0].settings.tolist() == ["optim.lr=0.1"]
+    assert training[training["return"] == 50.0].method.tolist() == ["ppo_ours"]
 
 
 def test_the_reference_is_compared_where_half_is_missing_and_at_equal_steps(tmp_path: Path) -> None:
     points = {"none:0": (100.0,), "mcar:0.5": (60.0,)}
     folders = [make_run(tmp_path / f"a{i}", seed=i, final=40.0 + i, points=points) for i in (0, 1)]
-    points = {"none:0": (100.0,), "mcar:0.5": (50.0,)}
     short = ("belief=dvrl", "total_frames=200")
     for i in (0, 1):
         path = make_run(tmp_path / f"b{i}", *short, seed=i, final=20.0, frames=[100, 200])
-        rows = pd.DataFrame(episodes(points)).assign(frames=200)
-        write_table(path / "robustness.csv", rows)
-        evaluation = pd.read_csv(path / "evaluation.csv").assign(kind="final")
-        write_table(path / "evaluation.csv", evaluation)
+        rows = episodes({"none:0": (100.0,), "mcar:0.5": (50.0,)})
+        write_table(path / "robustness.csv", [row | {"frames": 200} for row in rows])
+        own = pd.read_csv(path / "evaluation.csv").assign(kind="final")
+        write_table(path / "evaluation.csv", own)
         folders.append(path)
-    page = report(folders, tmp_path / "out")
-    half = row(tmp_path / "out", "mcar:0.5", table="comparison")
-    assert (half.over, half.margin, half.probability) == ("dvrl", 0.2, 1.0)
+    comparison = tables(folders)["comparison"]
+    half = row(comparison, "mcar:0.5")
+    assert (half.over, half.margin, half.probability) == ("dvrl", pytest.approx(0.2), 1.0)
     assert (half.steps, half.steps_over, half.paper) == (400, 200, 0.2)
-    equal = row(tmp_path / "out", "training", table="comparison")
+    equal = row(comparison, "training")
     assert equal.margin == pytest.approx(40.5 / 20 - 1)
     assert (equal.steps, equal.steps_over) == (200, 200)
-    assert "400 and 200" in page
 
 
 def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Path) -> None:
@@ -286,26 +278,22 @@ def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Pa
         for env, value in (("hopper", 2000.0), ("walker2d", 1500.0), ("reacher", -5.0))
         for seed in (0, 1)
     ]
-    report(folders, tmp_path / "out")
-    score = row(tmp_path / "out", "none:0", table="aggregate")
+    score = row(tables(folders)["aggregate"], "none:0")
     assert (score.tasks, score.runs) == (2, 4)
     assert (score.score, score.low, score.high) == (0.75, 0.75, 0.75)
 
 
-def test_sample_efficiency_is_told_of_complete_exact_observations(tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "a", "experiment=clean", "total_frames=400", final=2500.0)
+def test_sample_efficiency_counts_within_two_million_steps(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "a", final=2500.0)
     table = pd.DataFrame({"frames": [*range(1, 12), 3_000_000], "return": [*range(11), 10**6]})
-    write_table(folder / "episodes.csv", table)  # the last one comes after 2M steps
-    study = read_runs([folder])
-    assert study.runs.top_10_return.item() == np.arange(1, 11).mean()
-    assert study.runs.steps_to_threshold.item() == 200  # the first row of 100 episodes or more
-    assert "## Sample efficiency" in report([folder], tmp_path / "out")
-    assert "Sample eff" not in report([make_run(tmp_path / "b")], tmp_path / "other")
+    write_table(folder / "episodes.csv", table)
+    runs = read_runs([folder]).runs
+    assert runs.top_10_return.item() == np.arange(1, 11).mean()
+    assert runs.steps_to_threshold.item() == 200  # the first row of 100 episodes or more
 
 
-def test_learning_curves_are_thinned_over_the_whole_run(seeds: list[Path], tmp_path: Path) -> None:
-    report(seeds, tmp_path / "out", rows=2)
-    curve = pd.read_csv(tmp_path / "out" / "training.csv").query("seed == 1")
+def test_learning_curves_are_thinned_over_the_whole_run(seeds: list[Path]) -> None:
+    curve = read_runs(seeds, rows=2).training.query("seed == 1")
     assert curve.frames.tolist() == [200, 400]
     np.testing.assert_allclose(curve.missing_ratio, [0.2, 0.3])
 
@@ -330,7 +318,19 @@ def test_the_tables_alone_give_the_same_page_and_keep_the_notes(
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-@pytest.mark.parametrize("name", ["acktr-v4-1m", "clean-v4-1m", "methods-v4-500k"])
+def test_a_page_has_means_intervals_shares_and_what_diverged(tmp_path: Path) -> None:
+    clean = ("experiment=clean", "total_frames=400")
+    folders = [make_run(tmp_path / f"s{i}", *clean, seed=i, final=40.0 + i) for i in (0, 1)]
+    table = pd.DataFrame(episodes({"none:0": (90.0, 110.0), "mcar:0.5": (80.0, 90.0)}))
+    write_table(folders[0] / "robustness.csv", table.assign(diverged=[0, 0, 1, 0]))
+    page = report(folders, tmp_path / "out")
+    for text in ("**40.5** [40, 41]", "**85** [85, 85] 85% (diverged: 25%)", "commit: abc"):
+        assert text in page  # one of four episodes diverged
+    assert "the plain mean, and the interval" in page
+    assert "## Sample efficiency" in page
+
+
+@pytest.mark.parametrize("name", ["acktr-v4-1m", "methods-v4-500k"])
 def test_committed_tables_and_pages_are_what_the_committed_runs_give(
     name: str, tmp_path: Path
 ) -> None:

@@ -92,6 +92,21 @@ def summarise(study: Study) -> pd.DataFrame:
     return summary.iloc[sampled_first].drop(columns=["return_whole", "order"])
 
 
+def derived_tables(study: Study, reference: str) -> dict[str, pd.DataFrame]:
+    """Return ``summary``, ``aggregate`` and ``comparison`` of a study, by name.
+
+    Args:
+        study: its tables.
+        reference: method that the others are compared with.
+    """
+    summary = summarise(study)
+    return {
+        "summary": summary,
+        "aggregate": aggregate(study, summary),
+        "comparison": compare(study, summary, reference),
+    }
+
+
 def _complete(study: Study, summary: pd.DataFrame) -> pd.DataFrame:
     """Return the last evaluations of groups of which every seed was evaluated at the point."""
     keys = [*GROUP, "point", "mode"]
