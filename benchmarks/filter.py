@@ -3,7 +3,7 @@
 Two comparisons over [batch, time], 30 % of the entries missing, 2 % of the steps an episode start:
 
 - on tensors: BeliefFilter against nn.GRU and nn.LSTM of width 64, which know no resets (the least
-  that a GRUModule can cost), and against the textbook update at every step with autograd;
+  that a GRUModule can cost);
 - on TensorDicts: BeliefFilterModule against GRUModule (backends pad and scan) and LSTMModule.
 
 Ratios are times over GRU's; under 1 the filter is the faster one.
@@ -23,8 +23,6 @@ from torchrl_drbpn import BeliefFilter, BeliefFilterModule
 
 WIDTH = 64
 ACTION = 6
-# The longest sequence the textbook loop runs on: beyond it only takes longer by the same factor.
-LONGEST_TEXTBOOK = 64
 
 # (time, batch, obs, state) and the ratio to GRU that has to be reached / is aimed at.
 TARGETS = {
@@ -83,11 +81,9 @@ def _backward(module: nn.Module, out: torch.Tensor) -> None:
 
 def tensor_candidates(data: TensorDict, state: int) -> dict[str, Callable[[], None]]:
     """Make forward + backward calls on plain tensors."""
-    time, obs = data.shape[1], data["observation"].shape[-1]
+    obs = data["observation"].shape[-1]
     torch.manual_seed(0)
     filters = {"filter": BeliefFilter(obs, ACTION, state)}
-    if time <= LONGEST_TEXTBOOK:
-        filters["textbook loop"] = BeliefFilter(obs, ACTION, state, form="loop")
     mean = data["recurrent", "mean"][:, 0]
     reset = data["is_init"].squeeze(-1)
     inputs = [data["previous_action"], data["observation"], data["observed"], reset]

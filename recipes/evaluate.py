@@ -37,7 +37,7 @@ from training.errors import UserError
 from training.sensor_groups import have_names
 from training.sensors import sensor_names
 
-from torchrl_drbpn.functional.saturation import check_gate
+from torchrl_drbpn.functional.robust import check_gate
 
 
 def run(config: dict[str, Any]) -> int:

@@ -1,11 +1,25 @@
-"""What holds for every test: the global generator and the number of threads are given back."""
+"""What holds for every test: the native filter is this checkout's, global states are given back."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
+
+ROOT = Path(__file__).parents[1]
+
+
+def pytest_configure() -> None:
+    """Build the native filter where it is not there or older than its source; optional as ever."""
+    sources = [*ROOT.glob("torchrl_drbpn/csrc/*"), ROOT / "setup.py"]
+    there = [path.stat().st_mtime for path in ROOT.glob("torchrl_drbpn/_native_*")]
+    if not there or min(there) < max(path.stat().st_mtime for path in sources):
+        build = [sys.executable, "setup.py", "--quiet", "build_ext", "--inplace"]
+        subprocess.run(build, cwd=ROOT, check=False)
 
 
 @pytest.fixture(autouse=True)

@@ -119,14 +119,15 @@ def filter_sequence(
     action_matrix: Tensor | None = None,
     bias: Tensor | None = None,
     jacobian: Tensor | None = None,
-    restart: Tensor | None = None,
-    restart_mean: Tensor | None = None,
+    use_stored_state: Tensor | None = None,
+    stored_mean: Tensor | None = None,
 ) -> Sequence:
     """Filter [batch, time] data one row and one step at a time.
 
     `start_mean` (b, s) is the filtered belief of the step before the first one. At a step with
-    `reset` (b, t) the predicted belief is the initial one. At a step with `restart` (b, t) the
-    belief before the step is not the one just computed but the stored `restart_mean` (b, t, s).
+    `reset` (b, t) the predicted belief is the initial one. At a step with
+    `use_stored_state` (b, t) the belief before the step is not the one just computed but
+    `stored_mean` (b, t, s).
     Where both hold, the reset wins. `transition_cov` is a matrix or a function of (mean, action).
     """
     batch, time = observed.shape[:2]
@@ -136,8 +137,8 @@ def filter_sequence(
         cov = initial_cov if start_cov is None else start_cov[b]
         for t in range(time):
             action = previous_action[b, t]
-            if restart is not None and restart_mean is not None and restart[b, t]:
-                mean = restart_mean[b, t]
+            if use_stored_state is not None and stored_mean is not None and use_stored_state[b, t]:
+                mean = stored_mean[b, t]
             if reset[b, t]:
                 mean, cov = initial_mean, initial_cov
             else:

@@ -168,7 +168,11 @@ def test_predict_and_update_by_hand_give_the_same_step(kind):
         received = model.step(mean, None, action, observation, observed, reset, return_cov=True)
         moved, cov = model.transition(mean, action)
         predicted = functional.predict(
-            functional.Belief(mean, cov), lambda m, a: model.transition(m, a)[0], cov, action
+            functional.Belief(mean, cov),
+            lambda m, a: model.transition(m, a)[0],
+            cov,
+            action,
+            jacobian=None,
         )
         moved = torch.where(reset[:, None], model.initial_mean, predicted.mean)
         cov = torch.where(reset[:, None, None], model.initial_cov, predicted.cov)
@@ -204,18 +208,6 @@ def test_steps_equal_the_sequence_for_any_batch_shape(kind, batch):
         torch.testing.assert_close(
             out.log_likelihood, sequence.log_likelihood[..., t], rtol=1e-10, atol=1e-10
         )
-
-
-@pytest.mark.parametrize("form", ["innovation", "information", "loop"])
-@pytest.mark.parametrize("state", [3, 5, 7])
-def test_the_form_changes_nothing(form, state):
-    inputs = make_inputs(state)
-    expected = make_filter(OBS, ACTION, F64, state=state)(*inputs)
-    received = make_filter(OBS, ACTION, F64, state=state, form=form)(*inputs)
-    torch.testing.assert_close(received.mean, expected.mean, rtol=1e-9, atol=1e-10)
-    torch.testing.assert_close(
-        received.log_likelihood, expected.log_likelihood, rtol=1e-9, atol=1e-10
-    )
 
 
 def test_nothing_observed_leaves_the_predicted_belief_and_a_likelihood_of_0():
@@ -317,11 +309,7 @@ def test_it_survives_a_file_a_copy_and_a_cast():
         ({"obs_dim": 0}, "must be an int of at least 1, got 0"),
         ({"action_dim": 0}, "`action_dim` must be an int of at least 1, got 0"),
         ({"obs_dim": 0, "state_dim": None}, "`obs_dim` must be an int of at least 1, got 0"),
-        ({"form": "fast"}, "`form` must be 'auto', .* got 'fast'"),
-        (
-            {"form": "information", "emission": LinearGaussianEmission(5, 3, ACTION, cov="full")},
-            "`form` 'information' needs a diagonal emission covariance",
-        ),
+        ({"covariance": "propagated"}, "`covariance` must be 'constant', got 'propagated'"),
         ({"initial_cov": "scalar"}, "`initial_cov` must be one of diag, full, got 'scalar'"),
         ({"initial_std": 0.0}, "`initial_std` must be above its floor"),
         (
@@ -343,11 +331,51 @@ def test_a_filter_that_cannot_be_is_refused(kwargs, message):
         BeliefFilter(**{"obs_dim": OBS, "action_dim": ACTION, "state_dim": 3, **kwargs})
 
 
-def test_a_form_set_later_is_checked_when_it_is_used():
-    filter = BeliefFilter(OBS, ACTION, 3, dtype=F64)
-    filter.form = "fast"
-    with pytest.raises(ValueError, match=r"`form`.*'fast'"):
-        filter(*make_inputs(3))
+class Scaled(LinearGaussianEmission):
+    def forward(self, state, previous_action):
+        return 2 * super().forward(state, previous_action) + 1
+
+
+class Squared(LinearGaussianEmission):
+    def forward(self, state, previous_action):
+        return super().forward(state, previous_action).square()
+
+
+class Turned(GaussianTransition):
+    def forward(self, mean, action):
+        predicted = super().forward(mean, action)
+        return predicted._replace(mean=-predicted.mean)
+
+
+class Negative(LinearGaussianEmission):
+    def compact_cov(self):
+        return super().compact_cov() - 1
+
+
+def test_the_forward_of_a_subclass_counts():
+    model, inputs = make_filter(OBS, ACTION, F64, state=3), make_inputs(3)
+    for part, subclass in (("emission", Scaled), ("transition", Turned)):
+        own = copy.deepcopy(model)
+        getattr(own, part).__class__ = subclass
+        step = (inputs.mean, None, *(value[:, 0] for value in inputs[2:]))
+        moved = own.predict(inputs.mean, step[2], step[-1])
+        offset = own.emission(torch.zeros_like(inputs.mean), step[2])
+        H = 2 * own.emission.matrix if part == "emission" else own.emission.matrix
+        expected = functional.update(moved, *step[3:5], H, own.emission.cov(), offset)
+        torch.testing.assert_close(own.step(*step).mean, expected.mean, rtol=1e-9, atol=1e-9)
+        assert not torch.equal(own.step(*step).mean, model.step(*step).mean)
+
+
+@pytest.mark.parametrize(
+    ("emission", "message"),
+    [
+        (Squared(OBS, 3, ACTION), "`emission` must be affine"),
+        (Negative(OBS, 3, ACTION), "`emission, R` is not symmetric positive definite"),
+    ],
+)
+def test_a_model_that_cannot_be_is_named_at_construction(emission, message):
+    with pytest.raises(ValueError, match=message):
+        BeliefFilter(OBS, ACTION, 3, emission=emission)
 
 
 BAD = {

@@ -1,34 +1,31 @@
-"""Whole sequences: every fast form of `functional.filtering` against the slow truth.
+"""Whole sequences: both forms of `functional.filtering` against the slow truth.
 
-Specified here, in float64 unless the test is about float32:
+Specified here, in float64, for the PyTorch form, the native one, and a Q that depends on the state
+(step by step):
 
-- each form (innovation, native, information, loop) equals the row-deleting oracle to 1e-10, in
-  values and in the gradient by every input and parameter, for state smaller than, equal to and
-  larger than obs, with resets, restarts, frames that hold nothing, and diagonal or full noise;
-- the forms equal each other; a sequence equals its steps; a reset inside a sequence equals two
-  sequences; a restart equals a sequence begun from the stored belief; batch shape is immaterial;
+- each equals the row-deleting oracle to 1e-10, in values and in the gradient by every input and
+  parameter, for state smaller than, equal to and larger than obs, with resets, stored states,
+  frames that hold nothing, and diagonal or full noise;
+- a sequence equals its steps; a reset inside a sequence equals two sequences; a stored state equals
+  a sequence begun from it; batch shape is immaterial;
 - nothing observed: the means are the bare transition and the log-likelihood 0, exactly;
-- NaN or inf under a False mask changes nothing and gets a gradient of exactly 0;
-- float32 stays near float64, and its covariances positive definite, with the noise at its floor;
-- the gradient of a fast form cannot be differentiated again, and says so.
+- NaN or inf under a False mask, or a NaN belief before a reset, changes nothing and gets a gradient
+  of exactly 0;
+- every gradient can be differentiated again.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import oracles
 import pytest
 import torch
-from filter_problems import FAST, FORMS, SIZES, Problem, assert_equal, assert_same
+from filter_problems import FORMS, SIZES, Problem, assert_equal, assert_same
 from torch import Tensor
 
-from torchrl_drbpn.functional import (
-    choose_form,
-    filter_sequence,
-    filter_step,
-    filtered_cov,
-)
+from torchrl_drbpn.functional import filter_sequence, filter_step, filtered_cov
 
 # --- against the oracle -------------------------------------------------------------------------
 
@@ -38,16 +35,17 @@ from torchrl_drbpn.functional import (
     [
         pytest.param({"resets": False}, id="one episode"),
         pytest.param({"resets": True}, id="resets"),
-        pytest.param({"resets": True, "restarts": True}, id="resets and restarts"),
+        pytest.param({"resets": True, "stored": True}, id="resets and stored states"),
     ],
 )
-@pytest.mark.parametrize(("form", "full_noise"), FORMS)
+@pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_every_form_equals_the_oracle_in_values_and_all_gradients(
     state, obs, form, full_noise, events
 ):
     problem = Problem(state, obs, full_noise=full_noise, **events)
-    assert_same(problem, problem.fast(form), problem.slow())
+    assert_same(problem, problem.library(form), problem.oracle())
 
 
 @pytest.mark.parametrize(
@@ -60,42 +58,42 @@ def test_every_form_equals_the_oracle_in_values_and_all_gradients(
         pytest.param({"hidden": (4, 5, 3), "activation": "tanh"}, id="residual tanh tanh tanh"),
     ],
 )
-@pytest.mark.parametrize("form", FAST)
+@pytest.mark.parametrize("form", FORMS)
 def test_every_transition_network_equals_the_oracle(form, network):
-    problem = Problem(3, 5, seed=1, restarts=True, **network)
-    assert_same(problem, problem.fast(form), problem.slow())
+    problem = Problem(3, 5, seed=1, stored=True, **network)
+    assert_same(problem, problem.library(form), problem.oracle())
 
 
-@pytest.mark.parametrize("form", FAST)
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("rate", [0.0, 0.7, 1.0], ids=["complete", "sparse", "empty"])
 def test_every_missing_rate_equals_the_oracle(form, rate):
     problem = Problem(3, 5, seed=2)
     g = torch.Generator().manual_seed(2)
     problem.observed = torch.rand(problem.observed.shape, generator=g) >= rate
-    assert_same(problem, problem.fast(form), problem.slow())
+    assert_same(problem, problem.library(form), problem.oracle())
 
 
-@pytest.mark.parametrize("form", FAST)
+@pytest.mark.parametrize("form", FORMS)
 def test_one_output_alone_has_the_right_gradient(form):
     # PPO alone reads the means, the model loss alone the likelihood: autograd then hands the
     # reverse loop a zero or an absent gradient for the other.
-    problem = Problem(3, 5, restarts=True)
+    problem = Problem(3, 5, stored=True)
     for i in range(3):
-        found = problem.gradients((problem.fast(form)[i],))
-        truth = problem.gradients((problem.slow()[i],))
+        found = problem.gradients((problem.library(form)[i],))
+        truth = problem.gradients((problem.oracle()[i],))
         for name in truth:
             assert_equal(found[name], truth[name])
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_gradients_agree_with_finite_differences(state, obs, form):
-    problem = Problem(state, obs, batch=2, time=3, restarts=True, hidden=(3,))
+    problem = Problem(state, obs, batch=2, time=3, stored=True, hidden=(3,))
     names = list(problem.leaves)
 
     def run(*leaves: Tensor) -> tuple[Tensor, ...]:
         problem.leaves = dict(zip(names, leaves, strict=True))
-        return problem.fast(form)
+        return problem.library(form)
 
     leaves = tuple(problem.leaves.values())
     # One random direction an input: the complete Jacobian is covered by the oracle above.
@@ -103,7 +101,7 @@ def test_gradients_agree_with_finite_differences(state, obs, form):
 
 
 def test_a_transition_covariance_that_depends_on_the_state_equals_the_oracle():
-    problem = Problem(3, 5, restarts=True)
+    problem = Problem(3, 5, stored=True)
     base = problem.covs()[0]
     model = problem.model()
 
@@ -111,8 +109,8 @@ def test_a_transition_covariance_that_depends_on_the_state_equals_the_oracle():
         scale = 1 + mean.square().sum(-1) + action.square().sum(-1)
         return base * scale[..., None, None]
 
-    model = model._replace(transition_cov=scaled)
-    out = filter_sequence(model, *problem.arguments(), **problem.restarts(), return_cov=True)
+    model = replace(model, transition_cov=scaled)
+    out = filter_sequence(model, *problem.arguments(), **problem.stored(), return_cov=True)
     weights, biases = problem.network()
     _, p, r = problem.covs()
     truth = oracles.filter_sequence(
@@ -129,9 +127,8 @@ def test_a_transition_covariance_that_depends_on_the_state_equals_the_oracle():
         noise=torch.diag(r),
         action_matrix=problem.leaves["action_matrix"],
         bias=problem.leaves["bias"],
-        **problem.restarts(),
+        **problem.stored(),
     )
-    assert choose_form(model) == "loop"
     assert_same(
         problem,
         (out.mean, out.cov, out.log_likelihood),
@@ -142,56 +139,28 @@ def test_a_transition_covariance_that_depends_on_the_state_equals_the_oracle():
 # --- one form against another -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("state", "obs"), [(4, 30), (9, 9), (12, 5)], ids=str)
-def test_the_information_form_equals_the_innovation_form(state, obs):
-    problem = Problem(
-        state, obs, batch=5, time=12, restarts=True, hidden=(16, 16), activation="relu"
-    )
-    assert_same(problem, problem.fast("information"), problem.fast("innovation"))
-
-
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_a_diagonal_covariance_equals_its_variances(state, obs):
     problem = Problem(state, obs)
-    model = problem.model()
-    matrix = model._replace(emission_cov=model.emission_cov.diag())
-    for form in ("innovation", "loop"):
-        a = filter_sequence(model, *problem.arguments(), return_cov=True, form=form)
-        b = filter_sequence(matrix, *problem.arguments(), return_cov=True, form=form)
-        assert_same(problem, tuple(a), tuple(b))
+    model = replace(problem.model(), transition_cov=torch.arange(1.0, state + 1).double())
+    names = ("transition_cov", "emission_cov", "initial_cov")
+    model = replace(model, initial_cov=model.initial_cov.diagonal())
+    full = replace(model, **{name: getattr(model, name).diag() for name in names})
+    a = filter_sequence(model, *problem.arguments(), return_cov=True)
+    b = filter_sequence(full, *problem.arguments(), return_cov=True)
+    assert_same(problem, tuple(a), tuple(b))
 
 
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_the_chosen_form_is_the_smaller_factorisation_and_never_changes_the_answer(state, obs):
-    problem = Problem(state, obs)
-    chosen = choose_form(problem.model())
-    assert chosen == ("information" if obs > state else "innovation")
-    auto, forced = problem.fast("auto"), problem.fast(chosen)
-    for a, b in zip(auto, forced, strict=True):
-        assert_equal(a, b)  # "auto" may run the innovation form in C
-    full = Problem(state, obs, full_noise=True)
-    assert choose_form(full.model()) == "innovation"
-
-
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_stepping_through_time_equals_the_whole_sequence(state, obs, form):
     problem = Problem(state, obs)
-    whole = problem.fast(form)
-    model = problem.model()
+    whole = problem.library(form)
     mean, actions, observations, observed, reset = problem.arguments()
     rows = []
     for t in range(reset.shape[1]):
-        out = filter_step(
-            model,
-            mean,
-            actions[:, t],
-            observations[:, t],
-            observed[:, t],
-            reset[:, t],
-            return_cov=True,
-            form=form,
-        )
+        step = (mean, *(x[:, t] for x in (actions, observations, observed, reset)))
+        out = problem.run(form, *step, function=filter_step, return_cov=True)
         mean = out.mean
         rows.append(out)
     stepped = tuple(torch.stack(part, 1) for part in zip(*rows, strict=True))
@@ -201,29 +170,25 @@ def test_stepping_through_time_equals_the_whole_sequence(state, obs, form):
 # --- what a reset, a restart and a batch shape mean -----------------------------------------------
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_a_reset_inside_a_sequence_equals_two_sequences(form):
     problem = Problem(3, 5, resets=False)
     cut = 3
     problem.reset[:, cut] = True
-    whole = filter_sequence(problem.model(), *problem.arguments(), return_cov=True, form=form)
+    whole = problem.run(form, return_cov=True)
     mean, *rest = problem.arguments()
-    first = filter_sequence(
-        problem.model(), mean, *(x[:, :cut] for x in rest), return_cov=True, form=form
-    )
+    first = problem.run(form, mean, *(x[:, :cut] for x in rest), return_cov=True)
     # The belief that the second one is handed must not matter: its first step is a reset.
-    second = filter_sequence(
-        problem.model(), 50 + mean, *(x[:, cut:] for x in rest), return_cov=True, form=form
-    )
+    second = problem.run(form, 50 + mean, *(x[:, cut:] for x in rest), return_cov=True)
     for a, b, c in zip(whole, first, second, strict=True):
         assert_equal(a, torch.cat([b, c], 1))
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_nothing_before_a_reset_reaches_what_follows_it(form):
     problem = Problem(3, 5, resets=False)
     problem.reset[:, 3] = True
-    out = filter_sequence(problem.model(), *problem.arguments(), form=form)
+    out = problem.run(form)
     later = out.mean[:, 3:].square().sum() + out.log_likelihood[:, 3:].square().sum()
     start, observation = torch.autograd.grad(
         later, [problem.leaves["start_mean"], problem.leaves["observation"]]
@@ -233,64 +198,55 @@ def test_nothing_before_a_reset_reaches_what_follows_it(form):
     assert observation[:, 3:].abs().sum() > 0
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_the_initial_belief_learns_from_resets_and_only_from_them(form):
     problem = Problem(3, 5, resets=False)
     for reset in (False, True):
         problem.reset[:, 2] = reset
-        gradients = problem.gradients(problem.fast(form))
+        gradients = problem.gradients(problem.library(form))
         for name in ("initial_mean", "initial_root"):
             assert bool(gradients[name].abs().sum() > 0) == reset
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
-def test_a_restart_equals_a_sequence_begun_from_the_stored_belief(form):
-    problem = Problem(3, 5, resets=False, restarts=True)
+@pytest.mark.parametrize("form", FORMS)
+def test_a_stored_state_equals_a_sequence_begun_from_the_stored_belief(form):
+    problem = Problem(3, 5, resets=False, stored=True)
     cut = 3
-    problem.restart = torch.zeros_like(problem.reset)
-    problem.restart[:, cut] = True
-    model, arguments = problem.model(), problem.arguments()
-    stored = problem.leaves["restart_mean"]
-    whole = filter_sequence(
-        model, *arguments, restart=problem.restart, restart_mean=stored, return_cov=True, form=form
-    )
-    mean, *rest = arguments
-    first = filter_sequence(model, mean, *(x[:, :cut] for x in rest), return_cov=True, form=form)
-    second = filter_sequence(
-        model, stored[:, cut], *(x[:, cut:] for x in rest), return_cov=True, form=form
-    )
+    problem.use_stored = torch.zeros_like(problem.reset)
+    problem.use_stored[:, cut] = True
+    stored = problem.leaves["stored_mean"]
+    whole = problem.library(form)
+    mean, *rest = problem.arguments()
+    first = problem.run(form, mean, *(x[:, :cut] for x in rest), return_cov=True)
+    second = problem.run(form, stored[:, cut], *(x[:, cut:] for x in rest), return_cov=True)
     for a, b, c in zip(whole, first, second, strict=True):
         assert_equal(a, torch.cat([b, c], 1))
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
-def test_what_is_stored_where_no_restart_is_asked_for_does_not_matter(form):
-    problem = Problem(3, 5, restarts=True)
-    clean = problem.fast(form)
-    stored = problem.leaves["restart_mean"].detach()
-    junk = torch.where(problem.restart.unsqueeze(-1), stored, torch.full_like(stored, math.nan))
-    problem.leaves["restart_mean"] = junk.requires_grad_()
-    dirty = problem.fast(form)
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_stored_where_no_stored_state_is_asked_for_does_not_matter(form):
+    problem = Problem(3, 5, stored=True)
+    clean = problem.library(form)
+    stored = problem.leaves["stored_mean"].detach()
+    junk = torch.where(problem.use_stored.unsqueeze(-1), stored, torch.full_like(stored, math.nan))
+    problem.leaves["stored_mean"] = junk.requires_grad_()
+    dirty = problem.library(form)
     for a, b in zip(clean, dirty, strict=True):
         assert torch.equal(a, b)
     gradients = problem.gradients(dirty)
     assert all(torch.isfinite(g).all() for g in gradients.values())
-    unused = gradients["restart_mean"][~problem.restart]
+    unused = gradients["stored_mean"][~problem.use_stored]
     assert torch.equal(unused, torch.zeros_like(unused))
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("shape", [(), (1,), (6,), (2, 3), (3, 1, 2)], ids=str)
 def test_the_batch_shape_does_not_matter(shape, form):
     batch = math.prod(shape)
     problem = Problem(3, 5, batch=batch, time=4)
-    flat = filter_sequence(problem.model(), *problem.arguments(), return_cov=True, form=form)
-    shaped = filter_sequence(
-        problem.model(),
-        *(x.reshape(*shape, *x.shape[1:]) for x in problem.arguments()),
-        return_cov=True,
-        form=form,
-    )
+    flat = problem.run(form, return_cov=True)
+    arguments = (x.reshape(*shape, *x.shape[1:]) for x in problem.arguments())
+    shaped = problem.run(form, *arguments, return_cov=True)
     assert shaped.mean.shape == (*shape, 4, 3)
     assert shaped.cov.shape == (*shape, 4, 3, 3)
     assert shaped.log_likelihood.shape == (*shape, 4)
@@ -298,38 +254,31 @@ def test_the_batch_shape_does_not_matter(shape, form):
         assert_equal(a, b.reshape(a.shape))
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_memory_layout_does_not_matter(form):
-    problem = Problem(3, 5, batch=4, restarts=True)
-    plain = problem.fast(form)
-    for name in ("observation", "previous_action", "restart_mean"):
+    problem = Problem(3, 5, batch=4, stored=True)
+    plain = problem.library(form)
+    for name in ("observation", "previous_action", "stored_mean"):
         x = problem.leaves[name].detach()
         problem.leaves[name] = x.transpose(0, 1).contiguous().transpose(0, 1).requires_grad_()
         assert not problem.leaves[name].is_contiguous()
     problem.observed = problem.observed.mT.contiguous().mT
     problem.reset = problem.reset.mT.contiguous().mT
-    assert_same(problem, problem.fast(form), problem.slow())
-    for a, b in zip(problem.fast(form), plain, strict=True):
+    assert_same(problem, problem.library(form), problem.oracle())
+    for a, b in zip(problem.library(form), plain, strict=True):
         assert_equal(a, b)
 
 
-@pytest.mark.parametrize("form", FAST)
+@pytest.mark.parametrize("form", FORMS)
 def test_the_order_of_the_sensors_does_not_matter(form):
-    problem = Problem(3, 5)
-    order = torch.tensor([3, 0, 4, 1, 2])
-    model = problem.model()
-    permuted = model._replace(
-        emission_matrix=model.emission_matrix[order],
-        emission_cov=model.emission_cov[order],
-        action_matrix=model.action_matrix[order],
-        emission_offset=model.emission_offset[order],
-    )
+    problem, order = Problem(3, 5), torch.tensor([3, 0, 4, 1, 2])
+    straight = problem.library(form)
+    for name in ("matrix", "noise", "action_matrix", "bias"):
+        problem.leaves[name] = problem.leaves[name][order]
     mean, action, x, observed, reset = problem.arguments()
-    straight = filter_sequence(model, *problem.arguments(), return_cov=True, form=form)
-    shuffled = filter_sequence(
-        permuted, mean, action, x[..., order], observed[..., order], reset, return_cov=True,
-        form=form,
-    )  # fmt: skip
+    shuffled = problem.run(
+        form, mean, action, x[..., order], observed[..., order], reset, return_cov=True
+    )
     for a, b in zip(straight, shuffled, strict=True):
         assert_equal(a, b)
 
@@ -338,12 +287,12 @@ def test_the_order_of_the_sensors_does_not_matter(form):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_nothing_observed_leaves_the_predicted_belief_and_likelihood_zero(state, obs, form, dtype):
     problem = Problem(state, obs, dtype=dtype, time=5)
     problem.observed = torch.zeros_like(problem.observed)
-    mean, cov, ll = problem.fast(form)
+    mean, cov, ll = problem.library(form)
     assert torch.equal(ll, torch.zeros_like(ll))
     q, p, _ = problem.covs()
     first = problem.reset[..., None, None]
@@ -362,16 +311,18 @@ def test_nothing_observed_leaves_the_predicted_belief_and_likelihood_zero(state,
         assert torch.equal(gradients[name], torch.zeros_like(gradients[name])), name
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", ["pytorch", "step by step"])
 def test_an_empty_frame_moves_the_mean_by_nothing_at_all(form):
-    # Exactly: step by step the filtered mean IS what the transition returned, to the last bit.
+    # Exactly: step by step the filtered mean IS what the transition returned, to the last bit. (The
+    # native form has a transition of its own, in float64.)
     problem = Problem(3, 5, dtype=torch.float32)
     model = problem.model()
     mean, action, x, _, _ = (v[:, 0] if v.ndim > 2 else v for v in problem.arguments())
     nothing = torch.zeros_like(x, dtype=torch.bool)
     for reset in (False, True):
         flag = torch.full(mean.shape[:1], reset)
-        out = filter_step(model, mean, action, x, nothing, flag, return_cov=True, form=form)
+        step = (mean, action, x, nothing, flag)
+        out = problem.run(form, *step, function=filter_step, return_cov=True)
         expected = model.initial_mean.expand_as(mean) if reset else model.transition(mean, action)
         assert torch.equal(out.mean, expected)
         assert torch.equal(
@@ -381,15 +332,15 @@ def test_an_empty_frame_moves_the_mean_by_nothing_at_all(form):
 
 
 @pytest.mark.parametrize("junk", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_what_lies_under_a_false_mask_changes_nothing_and_has_zero_gradient(form, junk):
-    problem = Problem(3, 5, restarts=True)
-    clean = problem.fast(form)
+    problem = Problem(3, 5, stored=True)
+    clean = problem.library(form)
     clean_gradients = problem.gradients(clean)
     x = problem.leaves["observation"].detach()
     dirty = torch.where(problem.observed, x, torch.full_like(x, junk))
     problem.leaves["observation"] = dirty.requires_grad_()
-    spoilt = problem.fast(form)
+    spoilt = problem.library(form)
     for a, b in zip(clean, spoilt, strict=True):
         assert torch.equal(a, b)
     gradients = problem.gradients(spoilt)
@@ -402,12 +353,12 @@ def test_what_lies_under_a_false_mask_changes_nothing_and_has_zero_gradient(form
 # --- covariances --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_covariances_are_computed_only_where_asked_for(form):
     problem = Problem(3, 5)
-    out = filter_sequence(problem.model(), *problem.arguments(), form=form)
+    out = problem.run(form)
     assert out.cov is None
-    asked = filter_sequence(problem.model(), *problem.arguments(), return_cov=True, form=form)
+    asked = problem.run(form, return_cov=True)
     assert torch.equal(asked.mean, out.mean)
     assert_equal(asked.cov, filtered_cov(problem.model(), problem.observed, problem.reset))
 
@@ -415,54 +366,72 @@ def test_covariances_are_computed_only_where_asked_for(form):
 def test_with_a_constant_transition_covariance_only_masks_and_resets_matter_for_covariances():
     problem = Problem(3, 5, resets=False)
     problem.observed = problem.observed[:, :1].expand_as(problem.observed)
-    cov = problem.fast("innovation")[1]
+    cov = problem.library("pytorch")[1]
     assert_equal(cov, cov[:, :1].expand_as(cov))
     problem.reset[:, 2] = True
-    changed = problem.fast("innovation")[1]
+    changed = problem.library("pytorch")[1]
     assert_equal(changed[:, 3:], cov[:, 3:])
     some = problem.observed[:, 2].any(-1)
     assert ((changed[:, 2] - cov[:, 2])[some].abs().amax((-1, -2)) > 1e-6).all()
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
-@pytest.mark.parametrize("given", ["restart", "restart_mean"])
-def test_restart_and_restart_mean_come_together(form, given):
+@pytest.mark.parametrize("given", ["use_stored_state", "stored_mean"])
+def test_use_stored_state_and_stored_mean_come_together(given):
     problem = Problem(3, 5)
-    mean, action, x, observed, reset = problem.arguments()
-    one = {"restart": reset, "restart_mean": torch.zeros(*reset.shape, 3).to(x)}[given]
-    with pytest.raises(ValueError, match="`restart` and `restart_mean` come together"):
-        filter_sequence(
-            problem.model(), mean, action, x, observed, reset, form=form, **{given: one}
-        )
+    one = {"use_stored_state": problem.reset, "stored_mean": torch.zeros(3, 6, 3).double()}[given]
+    with pytest.raises(ValueError, match="`use_stored_state` and `stored_mean` come together"):
+        problem.run("auto", **{given: one})
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_nan_belief_before_a_reset_leaves_every_gradient_finite(form):
+    problem = Problem(3, 5, stored=True)
+    problem.reset[:, 0] = problem.reset[:, 2] = True
+    problem.use_stored[:, 2] = True
+    clean = problem.gradients(problem.library(form))
+    with torch.no_grad():
+        problem.leaves["start_mean"].fill_(math.nan)
+        problem.leaves["stored_mean"][:, 2] = math.nan
+    spoilt = problem.library(form)
+    for name, gradient in problem.gradients(spoilt).items():
+        assert torch.equal(gradient, clean[name]), name
+
+
+@pytest.mark.parametrize("form", ["auto", "pytorch", "step by step"])
+def test_no_step_at_all_returns_nothing(form):
+    problem = Problem(3, 5)
+    mean, *rest = problem.arguments()
+    out = problem.run(form, mean, *(x[:, :0] for x in rest), return_cov=True)
+    assert [tuple(x.shape) for x in out] == [(3, 0, 3), (3, 0, 3, 3), (3, 0)]
 
 
 # --- autograd manners -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_without_gradients_the_values_are_the_same_and_carry_no_graph(form):
-    problem = Problem(3, 5, restarts=True)
-    graph = problem.fast(form)
+    problem = Problem(3, 5, stored=True)
+    graph = problem.library(form)
     with torch.no_grad():
-        bare = problem.fast(form)
+        bare = problem.library(form)
     for a, b in zip(graph, bare, strict=True):
         assert torch.equal(a, b)
         assert a.requires_grad
         assert not b.requires_grad
 
 
-@pytest.mark.parametrize("form", FAST)
+@pytest.mark.parametrize("form", FORMS)
 def test_each_leaf_alone_gets_the_gradient_it_gets_among_all(form):
-    problem = Problem(3, 5, restarts=True)
-    together = problem.gradients(problem.fast(form))
+    problem = Problem(3, 5, stored=True)
+    together = problem.gradients(problem.library(form))
     for name in list(problem.leaves):
         for other, leaf in problem.leaves.items():
             leaf.requires_grad_(other == name)
-        outputs = tuple(out for out in problem.fast(form) if out.requires_grad)
+        outputs = tuple(out for out in problem.library(form) if out.requires_grad)
         # The same weights for the same outputs as in `gradients`.
         g = torch.Generator().manual_seed(3)
         loss = torch.zeros((), dtype=torch.float64)
-        for out in problem.fast(form):
+        for out in problem.library(form):
             weight = torch.randn(out.shape, generator=g, dtype=torch.float64)
             loss = loss + (weight * out).sum() + 0.1 * (weight * out.square()).sum()
         assert outputs, name
@@ -470,37 +439,30 @@ def test_each_leaf_alone_gets_the_gradient_it_gets_among_all(form):
         assert_equal(alone, together[name])
 
 
-@pytest.mark.parametrize("form", FAST)
-def test_differentiating_a_fast_form_twice_is_refused(form):
-    problem = Problem(3, 5)
-    mean, _, ll = problem.fast(form)
-    leaf = problem.leaves["bias0"]
-    (gradient,) = torch.autograd.grad(mean.square().sum() + ll.sum(), leaf, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.square().sum().backward()
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("obs", [2, 4], ids=["innovation", "information"])
+def test_every_form_can_be_differentiated_twice(obs, form):
+    problem = Problem(3, obs, batch=1, time=3, hidden=(3,), stored=True)
+    names = ("bias0", "noise", "matrix", "observation", "stored_mean", "initial_mean")
 
-
-def test_the_loop_can_be_differentiated_twice():
-    problem = Problem(2, 3, batch=1, time=2, hidden=(3,))
-    leaf = problem.leaves["bias0"]
-
-    def run(bias: Tensor) -> Tensor:
-        problem.leaves["bias0"] = bias
-        mean, _, ll = problem.fast("loop")
+    def run(*leaves: Tensor) -> Tensor:
+        problem.leaves |= dict(zip(names, leaves, strict=True))
+        mean, _, ll = problem.library(form)
         return mean.square().sum() + ll.sum()
 
-    assert torch.autograd.gradgradcheck(run, (leaf,))
+    leaves = tuple(problem.leaves[name] for name in names)
+    assert torch.autograd.gradgradcheck(run, leaves, fast_mode=True)
 
 
-@pytest.mark.parametrize("form", [*FAST, "loop"])
+@pytest.mark.parametrize("form", FORMS)
 def test_inputs_are_left_as_they_were(form):
-    problem = Problem(3, 5, restarts=True)
+    problem = Problem(3, 5, stored=True)
     before = {k: v.detach().clone() for k, v in problem.leaves.items()}
-    masks = (problem.observed.clone(), problem.reset.clone(), problem.restart.clone())
-    problem.gradients(problem.fast(form))
+    masks = (problem.observed.clone(), problem.reset.clone(), problem.use_stored.clone())
+    problem.gradients(problem.library(form))
     for name, leaf in problem.leaves.items():
         assert torch.equal(leaf, before[name]), name
-    for a, b in zip(masks, (problem.observed, problem.reset, problem.restart), strict=True):
+    for a, b in zip(masks, (problem.observed, problem.reset, problem.use_stored), strict=True):
         assert torch.equal(a, b)
 
 
@@ -519,38 +481,56 @@ def test_a_mask_of_wrong_dtype_or_shape_is_refused(spoil):
     problem = Problem(3, 5)
     problem.observed = spoil(problem.observed)
     with pytest.raises(ValueError, match=r"`observed` must be"):
-        problem.fast("auto")
-    arguments = [x if x.ndim < 2 or i == 0 else x[:, 0] for i, x in enumerate(problem.arguments())]
-    with pytest.raises(ValueError, match=r"`observed` must be"):
-        filter_step(problem.model(), *arguments)
+        problem.library("auto")
 
 
 def test_an_unknown_form_is_refused():
-    problem = Problem(3, 5)
-    with pytest.raises(ValueError, match="`form` must be 'auto', 'innovation', 'information'"):
-        problem.fast("fast")
-
-
-def test_the_information_form_of_a_full_noise_covariance_is_refused():
-    problem = Problem(3, 5, full_noise=True)
-    with pytest.raises(ValueError, match="`form` 'information' needs a diagonal emission"):
-        problem.fast("information")
-
-
-@pytest.mark.parametrize("form", FAST)
-def test_a_fast_form_of_an_arbitrary_transition_is_refused(form):
-    problem = Problem(3, 5)
-    model = problem.model()
-    for other in (
-        model._replace(transition=lambda mean, action: mean),
-        model._replace(transition_cov=lambda mean, action: torch.eye(3, dtype=torch.float64)),
+    with pytest.raises(
+        ValueError, match="`form` must be 'auto', 'pytorch' or 'native', got 'fast'"
     ):
-        with pytest.raises(ValueError, match="needs a MeanNetwork transition with a constant"):
-            filter_sequence(other, *problem.arguments(), form=form)
+        Problem(3, 5).run("fast")
+
+
+@pytest.mark.parametrize("name", ["mean", "previous_action", "observation"])
+@pytest.mark.parametrize("form", FORMS)
+def test_an_input_of_wrong_size_is_one_clear_line(form, name):
+    problem = Problem(3, 5)
+    names = ("mean", "previous_action", "observation", "observed", "reset")
+    arguments = dict(zip(names, problem.arguments(), strict=True))
+    arguments[name] = arguments[name][..., :-1]
+    with pytest.raises(ValueError, match=f"`{name}` must have shape"):
+        problem.run(form, *arguments.values())
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("emission_cov", torch.ones(4), r"`emission_cov` must have shape \(5, 5\) or \(5,\)"),
+        ("initial_cov", torch.ones(3, 2), r"`initial_cov` must have shape \(3, 3\) or \(3,\)"),
+        ("transition_cov", torch.ones(2, 3, 3), "`transition_cov` must have shape"),
+        ("initial_mean", torch.zeros(4), "`initial_mean` must have shape"),
+        ("emission_offset", torch.zeros(5).float(), "`emission_offset` is torch.float32"),
+        ("action_matrix", torch.zeros(5), r"`action_matrix` \(obs, action\)"),
+        ("emission_matrix", torch.zeros(5, 3).long(), "must be floating point"),
+    ],
+)
+def test_a_state_space_with_a_wrong_field_is_one_clear_line(field, value, message):
+    model = Problem(3, 5).model()
+    if value.dtype == torch.float32 and field != "emission_offset":
+        value = value.double()
+    with pytest.raises(ValueError, match=message):
+        replace(model, **{field: value})
+
+
+def test_a_transition_of_wrong_width_is_one_clear_line():
+    problem = Problem(3, 5)
+    problem.leaves["weight0"] = problem.leaves["weight0"][:, 1:]
+    with pytest.raises(ValueError, match=r"`transition.weights\[0\]` must have shape \(5, 5\)"):
+        problem.model()
 
 
 def test_the_covariance_of_a_state_dependent_model_cannot_be_had_from_the_masks_alone():
     problem = Problem(3, 5)
-    model = problem.model()._replace(transition_cov=lambda mean, action: mean)
+    model = replace(problem.model(), transition_cov=lambda mean, action: mean)
     with pytest.raises(ValueError, match="`transition_cov` depends on the state"):
         filtered_cov(model, problem.observed, problem.reset)

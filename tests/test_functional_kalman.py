@@ -318,7 +318,9 @@ def test_a_batch_equals_a_loop_over_its_members(shape):
     x, offset = randn(*shape, 4), randn(*shape, 4)
     observed = torch.rand(*shape, 4, generator=g) < 0.5
 
-    predicted = F.predict(Belief(mean, cov), system.transition, system.transition_cov, action)
+    predicted = F.predict(
+        Belief(mean, cov), system.transition, system.transition_cov, action, jacobian=None
+    )
     propagated = F.predict(
         Belief(mean, cov),
         system.transition,
@@ -427,7 +429,7 @@ def test_two_steps_by_hand():
     half_log = 0.5 * math.log(2 * math.pi * 8)
     belief = Belief(vector(0.0), one)
     for action, x, mean, ll in [(1.0, 7.0, 2.0, -1 - half_log), (-1.0, 3.0, 1.0, -half_log)]:
-        predicted = F.predict(belief, lambda m, a: m + a, one, vector(action))
+        predicted = F.predict(belief, lambda m, a: m + a, one, vector(action), jacobian=None)
         arguments = (predicted, vector(x), seen, 2 * one, 4 * one, d)
         actual_ll = F.log_likelihood(*arguments)
         belief = F.update(*arguments)
@@ -451,12 +453,15 @@ def test_two_steps_by_hand_with_the_covariance_propagated():
         assert_equal(belief.cov, cov * one)
 
 
-def test_predict_forgets_the_covariance_unless_a_jacobian_is_given():
+def test_predict_forgets_the_covariance_where_the_jacobian_is_none():
     system, belief, _, _, g = case(3, 4)
     action = torch.randn(5, 2, generator=g, dtype=torch.float64)
     q = system.transition_cov
-    plain = F.predict(belief, system.transition, q, action)
-    wider = F.predict(Belief(belief.mean, 9 * belief.cov), system.transition, q, action)
+    plain = F.predict(belief, system.transition, q, action, jacobian=None)
+    wide = Belief(belief.mean, 9 * belief.cov)
+    wider = F.predict(wide, system.transition, q, action, jacobian=None)
+    with pytest.raises(TypeError, match="jacobian"):
+        F.predict(belief, system.transition, q, action)
     moved = F.predict(belief, system.transition, q, action, jacobian=system.dynamics)
     assert_equal(plain.mean, belief.mean @ system.dynamics.T + action @ system.control.T)
     assert torch.equal(plain.cov.expand_as(belief.cov), q.expand_as(belief.cov))
@@ -570,7 +575,9 @@ def test_inputs_are_left_as_they_were():
     F.update(belief, *inputs[2:])
     F.log_likelihood(belief, *inputs[2:])
     F.innovation(belief, *inputs[2:])
-    F.predict(belief, system.transition, system.transition_cov, torch.zeros(5, 2).double())
+    F.predict(
+        belief, system.transition, system.transition_cov, torch.zeros(5, 2).double(), jacobian=None
+    )
     for a, b in zip(inputs, before, strict=True):
         assert torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
 
@@ -588,3 +595,46 @@ def test_a_mask_of_wrong_dtype_or_shape_is_refused(function, spoil):
     observed = spoil(some_masks(len(x), 5, g))
     with pytest.raises(ValueError, match=r"`observed` must be"):
         getattr(F, function)(belief, x, observed, system.matrix, system.noise, offset)
+
+
+def test_variances_are_a_diagonal_covariance_and_never_a_row():
+    belief, x = Belief(torch.zeros(2), torch.ones(2)), torch.tensor([1.0, 2.0])
+    seen, eye, r = torch.ones(2, dtype=torch.bool), torch.eye(2), torch.tensor([0.1, 0.2])
+    full = (Belief(belief.mean, eye), x, seen, eye, r.diag())
+    short = (belief, x, seen, eye, r)
+    assert_equal(F.update(*short).mean, torch.tensor([1 / 1.1, 2 / 1.2]), 1e-6)
+    for function in (F.update, F.innovation):
+        for a, b in zip(function(*short), function(*full), strict=True):
+            assert torch.equal(a, b)
+    assert torch.equal(F.log_likelihood(*short), F.log_likelihood(*full))
+    for jacobian in (None, 2 * eye):
+        a = F.predict(belief, lambda m, _: m, r, x, jacobian=jacobian)
+        b = F.predict(full[0], lambda m, _: m, r.diag(), x, jacobian=jacobian)
+        assert torch.equal(a.cov, b.cov)
+
+
+@pytest.mark.parametrize("function", ["innovation", "update", "log_likelihood"])
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (0, Belief(torch.zeros(3), torch.ones(2)), r"`belief.cov` must be .* \(3,\).* got \(2,\)"),
+        (3, torch.ones(5, 2), r"`emission_matrix` must have shape \(obs, state\) = \(5, 3\)"),
+        (4, torch.ones(5, 1), r"`emission_cov` must be a covariance .* got \(5, 1\)"),
+        (4, torch.ones(1), r"`emission_cov` must be a covariance .* got \(1,\)"),
+        (5, torch.ones(1), r"`offset` must have shape"),
+    ],
+)
+def test_a_wrong_size_is_one_clear_line(function, place, value, message):
+    seen = torch.ones(5, dtype=torch.bool)
+    step = [Belief(torch.zeros(3), torch.eye(3)), torch.ones(5), seen, torch.ones(5, 3)]
+    step += [torch.ones(5), torch.zeros(5)]
+    step[place] = value
+    with pytest.raises(ValueError, match=message):
+        getattr(F, function)(*step)
+
+
+@pytest.mark.parametrize("function", ["update", "log_likelihood"])
+def test_two_exact_sensors_of_one_quantity_are_one_clear_line(function):
+    belief, seen = Belief(torch.zeros(1), torch.eye(1)), torch.ones(2, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"not positive definite.*without noise \(R = 0\)"):
+        getattr(F, function)(belief, torch.ones(2), seen, torch.ones(2, 1), torch.zeros(2))

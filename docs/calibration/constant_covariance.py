@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 import sys
+from dataclasses import replace
 
 import pandas as pd
 import torch
@@ -23,8 +24,8 @@ from torch import Tensor
 
 from torchrl_drbpn.functional import (
     Belief,
-    MeanNetwork,
     StateSpace,
+    TransitionMLP,
     filter_sequence,
     full_cov,
     innovation,
@@ -63,14 +64,14 @@ def system() -> StateSpace:
         stationary = A @ stationary @ A.mT + Q
     zero = torch.zeros(STATE, dtype=torch.float64)
     weight = torch.cat([A, torch.zeros(STATE, 1, dtype=torch.float64)], -1)
-    f = MeanNetwork((weight,), (zero,), False, "relu")
+    f = TransitionMLP((weight,), (zero,), False, "relu")
     return StateSpace(f, Q, eye, R, torch.zeros(STATE, 1, dtype=torch.float64), zero, zero,
                       stationary)  # fmt: skip
 
 
 def dynamics(model: StateSpace) -> Tensor:
     """Return A."""
-    assert isinstance(model.transition, MeanNetwork)
+    assert isinstance(model.transition, TransitionMLP)
     return model.transition.weights[0][:, :STATE]
 
 
@@ -113,7 +114,7 @@ def trained_cov(
     reset[:, 0] = True
     action = torch.zeros(rows, time, 1, dtype=torch.float64)
     for _ in range(iterations):
-        learned = model._replace(transition_cov=full_cov(raw, MIN_STD))
+        learned = replace(model, transition_cov=full_cov(raw, MIN_STD))
         out = filter_sequence(learned, model.initial_mean, action, observation, observed, reset)
         optimiser.zero_grad()
         (-out.log_likelihood.sum() / observed.sum()).backward()

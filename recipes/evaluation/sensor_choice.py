@@ -120,14 +120,13 @@ def learned_sensors(trained: TrainedAgent) -> SensorModel:
         )
     env, noise = trained.settings.env, trained.settings.noise
     norm = next(t for t in trained.statistics.transform if isinstance(t, MaskedObservationNorm))
-    wide = model.double()
     variance = (noise.sigma * noise.scale) ** 2 + noise.spike_probability * noise.spike_std**2
     return SensorModel(
-        sensor_names(env.id, env.version, wide.emission_matrix.shape[0]),
+        sensor_names(env.id, env.version, model.obs_dim),
         trained.settings.seed,
-        wide.emission_matrix.detach(),
-        model.transition_cov.double().detach(),
-        wide.full_emission_cov().detach(),
+        model.emission_matrix.double().detach(),
+        model.constant_cov().double().detach(),
+        model.full_emission_cov().double().detach(),
         math.sqrt(variance) / norm.scale.double(),
     )
 

@@ -15,7 +15,7 @@ from torchrl.record.loggers import get_logger
 from torchrl.record.loggers.common import Logger
 
 from torchrl_drbpn import BeliefDivergedError
-from torchrl_drbpn.functional import native_error
+from torchrl_drbpn.functional import native_status
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.config import Settings, read_settings
 from training.console import ProgressBar, say
@@ -60,7 +60,7 @@ def run(config: Mapping[str, Any], folder: Path) -> int:
                 f"env.backend={settings.env.backend} can't save the state of "
                 f"{settings.env.env_id}: going on with new episodes"
             )
-    slower = native_error() if settings.belief["name"] == "drbpn" else None
+    slower = native_status() if settings.belief["name"] == "drbpn" else None
     if slower is not None:
         say(f"the belief filter runs in PyTorch, which is slower than in C: {slower}")
     folder.mkdir(parents=True, exist_ok=True)

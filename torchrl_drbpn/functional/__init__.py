@@ -7,11 +7,8 @@ from torchrl_drbpn.functional.calibration import (
     nees,
     nis,
 )
-from torchrl_drbpn.functional.compiled import native_error
 from torchrl_drbpn.functional.filtering import (
     FilterOutput,
-    FollowedOutput,
-    filter_followed,
     filter_sequence,
     filter_step,
     filtered_cov,
@@ -39,7 +36,7 @@ from torchrl_drbpn.functional.missingness import (
     sample_spikes,
     sample_working,
 )
-from torchrl_drbpn.functional.model import Following, StateSpace, choose_form, predict_step
+from torchrl_drbpn.functional.native import native_status
 from torchrl_drbpn.functional.particles import (
     DiagonalGaussian,
     Outcome,
@@ -55,18 +52,15 @@ from torchrl_drbpn.functional.particles import (
     resample,
     systematic_ancestors,
 )
-from torchrl_drbpn.functional.recurrence import MeanNetwork
-from torchrl_drbpn.functional.saturation import saturate_innovation
+from torchrl_drbpn.functional.robust import saturate_innovation
 from torchrl_drbpn.functional.sensor_selection import SensorSelection, select_sensors
+from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP, predict_step
 
 __all__ = [
     "Belief",
     "Consistency",
     "DiagonalGaussian",
     "FilterOutput",
-    "FollowedOutput",
-    "Following",
-    "MeanNetwork",
     "MissingnessMechanism",
     "OutageRates",
     "Outcome",
@@ -76,14 +70,13 @@ __all__ = [
     "Prospect",
     "SensorSelection",
     "StateSpace",
+    "TransitionMLP",
     "chi_square_quantile",
-    "choose_form",
     "consistency",
     "count_always_observed",
     "diagonal_log_density",
     "draw_mechanism",
     "effective_sample_size",
-    "filter_followed",
     "filter_sequence",
     "filter_step",
     "filtered_cov",
@@ -95,7 +88,7 @@ __all__ = [
     "masked_cov",
     "masked_log_density",
     "missing_probability",
-    "native_error",
+    "native_status",
     "nees",
     "nis",
     "outage_rates",

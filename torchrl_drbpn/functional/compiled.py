@@ -22,14 +22,12 @@ import tempfile
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-__all__ = ["NativeError", "load_library", "native_error", "spd_inverse"]
+__all__ = ["NativeError", "load_library", "native_error"]
 
-# native.c, with the pieces native_*.h, is the filter, moments.c the running statistics, heads.c
+# moments.c is the running statistics, heads.c
 # PPO's terms of two small networks, arrivals.c what goes missing.
 _FOLDER = Path(__file__).parent
-_MAX_SIZE = 64  # a group of matrices stays in cache up to here
 _REALS = {torch.float32: "float", torch.float64: "double"}
 # Vectors of the width that PyTorch found: the compiled file then runs wherever its name is equal.
 _MACHINE_FLAGS = {"AVX512": ["-march=x86-64-v4"], "AVX2": ["-march=x86-64-v3"]}
@@ -44,12 +42,12 @@ class NativeError(RuntimeError):
 
 
 @functools.cache
-def load_library(dtype: torch.dtype, source: str = "native") -> ctypes.CDLL:
+def load_library(dtype: torch.dtype, source: str = "moments") -> ctypes.CDLL:
     """Load a C file of this folder, compiled for a dtype; compile it where that is still to do.
 
     Args:
         dtype: ``torch.float32`` or ``torch.float64``.
-        source: ``"native"``, ``"moments"``, ``"heads"`` or ``"arrivals"``.
+        source: ``"moments"`` or ``"arrivals"``.
 
     Returns:
         Its functions.
@@ -59,7 +57,7 @@ def load_library(dtype: torch.dtype, source: str = "native") -> ctypes.CDLL:
 
     Example:
         >>> import torch
-        >>> native_error() is not None or hasattr(load_library(torch.float32), "spd_inverse")
+        >>> native_error() is not None or hasattr(load_library(torch.float32), "moments_learn")
         True
     """
     if os.environ.get("TORCHRL_DRBPN_NATIVE", "1") == "0":
@@ -106,12 +104,12 @@ def _texts(file: Path) -> list[str]:
 
 
 @functools.cache
-def native_error(dtype: torch.dtype = torch.float32, source: str = "native") -> str | None:
+def native_error(dtype: torch.dtype = torch.float32, source: str = "moments") -> str | None:
     """Say why the C form cannot be had on this machine; compiles it where that is still to do.
 
     Args:
         dtype: of the filter's tensors.
-        source: ``"native"`` for the filter, ``"moments"`` for the running statistics, ``"heads"``
+        source: ``"moments"`` for the running statistics, ``"arrivals"``
             for PPO's terms, ``"arrivals"`` for what goes missing.
 
     Returns:
@@ -128,40 +126,3 @@ def native_error(dtype: torch.dtype = torch.float32, source: str = "native") -> 
     except NativeError as error:
         return str(error)
     return None
-
-
-def spd_inverse(matrix: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Invert many small symmetric positive definite matrices, without a gradient.
-
-    Eight at a time and in float64, where LAPACK takes one after the other.
-
-    Args:
-        matrix: shape ``(*batch, n, n)``; lower triangles are read.
-
-    Returns:
-        Inverses, shape ``(*batch, n, n)``, and log-determinants, shape ``(*batch,)``; NaN for a
-        matrix that is not positive definite. None where the C code does not run.
-
-    Example:
-        >>> import torch
-        >>> found = spd_inverse(2 * torch.eye(3).expand(5, 3, 3))
-        >>> found is None or torch.allclose(found[0][4], torch.eye(3) / 2)
-        True
-    """
-    n, dtype = matrix.shape[-1], matrix.dtype
-    if (
-        matrix.device.type != "cpu"
-        or n > _MAX_SIZE
-        or torch.compiler.is_compiling()
-        or native_error(dtype) is not None
-    ):
-        return None
-    matrix = matrix.contiguous()
-    inverse, log_det = torch.empty_like(matrix), matrix.new_empty(matrix.shape[:-2])
-    scratch = torch.empty(3 * n * n * 8, dtype=torch.float64, device=matrix.device)
-    load_library(dtype).spd_inverse(
-        ctypes.c_long(n),
-        ctypes.c_long(log_det.numel()),
-        *(ctypes.c_void_p(x.data_ptr()) for x in (matrix, inverse, log_det, scratch)),
-    )
-    return inverse, log_det

@@ -1,58 +1,41 @@
-"""A whole sequence through the belief filter: fast forms, and the generic loop behind them.
+"""A whole sequence through the belief filter, and one step of it.
 
-Four ways give the same numbers; :func:`filter_sequence` chooses:
+Two forms give the same numbers. The PyTorch form here is plain autograd on any device and under
+every transformation; :mod:`.native` is one operator on the CPU. :func:`.unsupported_reason` is the
+rule which runs.
 
-- *innovation form* (constant Q): factorises obs x obs, A = M (H Q H' + R) M' for every mask of the
-  minibatch in one batched call; any R;
-- *information form* (constant Q, diagonal R): factorises state x state,
-  inv(cov) = inv(Q) + sum_i m_i / r_i h_i h_i'; the cheaper one where obs exceeds state;
-- *native*: the cheaper one of these two in C (:mod:`.native`), where a C compiler is found, on the
-  CPU;
-- *loop*: :mod:`.kalman` at every step, for any transition and for a Q that depends on the state.
+Where Q is constant, predicted covariances depend on the episode starts alone, so that the gains of
+a whole minibatch are one batched computation ahead of the mean recurrence. The gain comes from what
+is cheaper to factorise: S = H P H' + R, obs x obs, or the precision inv(P) + H' inv(R) H, state x
+state (diagonal R, obs > state). A Q that depends on the state takes :mod:`.kalman` step by step.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.forms import (
-    gain_precision,
-    information_likelihood,
-    run_information,
-    run_innovation,
-    run_loop,
-    run_native,
-)
+from torchrl_drbpn.functional import native
 from torchrl_drbpn.functional.gaussian import (
     LOG_2PI,
+    Belief,
     check_observed,
     masked_cov,
+    without_autocast,
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import log_likelihood, update
-from torchrl_drbpn.functional.model import (
-    Following,
-    Form,
-    StateSpace,
-    checked_form,
-    constant_cov,
-    initial_belief,
-    predict_step,
-)
-from torchrl_drbpn.functional.native import native_refusal
-from torchrl_drbpn.functional.precision import outside_autocast
+from torchrl_drbpn.functional.state_space import StateSpace, predict_step
 
-__all__ = [
-    "FilterOutput",
-    "FollowedOutput",
-    "filter_followed",
-    "filter_sequence",
-    "filter_step",
-    "filtered_cov",
-]
+__all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
+
+Form = Literal["auto", "pytorch", "native"]
+# A function of a predicted covariance (state, state), and its value at every step.
+EveryStep = Callable[[Callable[[Tensor], Tensor]], Tensor]
 
 
 class FilterOutput(NamedTuple):
@@ -76,29 +59,6 @@ class FilterOutput(NamedTuple):
     log_likelihood: Tensor
 
 
-class FollowedOutput(NamedTuple):
-    """Hold what the filter returns where observations follow.
-
-    Args:
-        mean: as in :class:`FilterOutput`.
-        cov: as there.
-        log_likelihood: as there.
-        following_log_likelihood: of the observations that follow, shape ``(count,)``, nats.
-
-    Example:
-        >>> import torch
-        >>> out = FollowedOutput(torch.zeros(2), None, torch.zeros(()), torch.zeros(3))
-        >>> len(out.following_log_likelihood)
-        3
-    """
-
-    mean: Tensor
-    cov: Tensor | None
-    log_likelihood: Tensor
-    following_log_likelihood: Tensor
-
-
-@outside_autocast
 def filter_step(
     model: StateSpace,
     mean: Tensor,
@@ -110,7 +70,7 @@ def filter_step(
     return_cov: bool = False,
     form: Form = "auto",
 ) -> FilterOutput:
-    """Filter one step for any batch of beliefs.
+    """Filter one step for any batch of beliefs: a sequence of one.
 
     Eq. (8), (10), (12) [DRBPN].
 
@@ -129,6 +89,9 @@ def filter_step(
     Returns:
         :class:`FilterOutput` of shapes ``(*batch, ...)``.
 
+    Raises:
+        ValueError: as :func:`filter_sequence`.
+
     Example:
         >>> import torch
         >>> eye = torch.eye(2)
@@ -141,58 +104,119 @@ def filter_step(
         >>> bool((out.mean == 1).all()), bool((out.log_likelihood == 0).all())
         (True, True)
     """
-    check_observed(observation, observed)
-    chosen = checked_form(model, form)
-    if (
-        chosen != "loop"
-        and form == "auto"
-        and not torch.is_grad_enabled()  # with a gradient, one that can be differentiated again
-        and native_refusal(model, mean, previous_action, observation) is None
-    ):
-        x, seen = observation.unsqueeze(reset.ndim), observed.unsqueeze(reset.ndim)
-        action, start = previous_action.unsqueeze(reset.ndim), reset.unsqueeze(-1)
-        m, ll, _ = run_native(model, mean, action, x, seen, start, None, None)
-        cov = filtered_cov(model, observed, reset) if return_cov else None
-        return FilterOutput(m.squeeze(-2), cov, ll.squeeze(-1))
-    predicted = predict_step(model, mean, previous_action, reset)
-    H, offset = model.emission_matrix, model.offset(previous_action)
-    if chosen == "loop":
-        R = model.full_emission_cov()
-        filtered = update(predicted, observation, observed, H, R, offset)
-        ll = log_likelihood(predicted, observation, observed, H, R, offset)
-        return FilterOutput(filtered.mean, filtered.cov if return_cov else None, ll)
+    out = filter_sequence(
+        model, mean, previous_action.unsqueeze(-2), observation.unsqueeze(-2),
+        observed.unsqueeze(-2), reset.unsqueeze(-1), return_cov=return_cov, form=form,
+    )  # fmt: skip
+    cov = None if out.cov is None else out.cov.squeeze(-3)
+    return FilterOutput(out.mean.squeeze(-2), cov, out.log_likelihood.squeeze(-1))
 
-    # Constant Q: the innovation covariances exist twice only, for ordinary and for first steps.
-    m = predicted.mean
-    residual = zero_missing(zero_missing(observation, observed) - (offset + m @ H.mT), observed)
-    row = reset.unsqueeze(-1)
-    if chosen == "information":
-        # In float64, as in the sequence: the two must agree to the rounding of their own dtype.
-        wide = model.double()
-        residual = residual.double()
-        weight = observed / wide.emission_cov
-        precision, log_det_prior = gain_precision(wide, weight, row)
-        factor = torch.linalg.cholesky(precision)
-        pull = (weight * residual) @ wide.emission_matrix
-        step = torch.cholesky_solve(pull.unsqueeze(-1), factor).squeeze(-1)
-        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + log_det_prior
-        ll = information_likelihood(wide, step, residual, weight, observed, log_det, row)
-        step, ll = step.to(m.dtype), ll.to(m.dtype)
-    else:
-        wide = model.double()
-        wide_H, Q, R = wide.emission_matrix, constant_cov(wide), wide.full_emission_cov()
-        residual = residual.to(R.dtype)
-        cross, initial_cross = Q @ wide_H.mT, wide.initial_cov @ wide_H.mT
-        S = torch.where(row.unsqueeze(-1), wide_H @ initial_cross + R, wide_H @ cross + R)
-        factor = torch.linalg.cholesky(masked_cov(S, observed))
-        z = torch.cholesky_solve(residual.unsqueeze(-1), factor).squeeze(-1)
-        step = torch.where(row, z @ initial_cross.mT, z @ cross.mT).to(m.dtype)
-        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        count = observed.sum(-1).to(R.dtype)  # an integer times a float would be float32
-        ll = (-0.5 * ((z * residual).sum(-1) + log_det + count * LOG_2PI)).to(m.dtype)
-    ll = torch.where(observed.any(-1), ll, 0.0)
-    cov = filtered_cov(model, observed, reset) if return_cov else None
-    return FilterOutput(m + step, cov, ll)
+
+def filter_sequence(
+    model: StateSpace,
+    mean: Tensor,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    *,
+    use_stored_state: Tensor | None = None,
+    stored_mean: Tensor | None = None,
+    return_cov: bool = False,
+    form: Form = "auto",
+) -> FilterOutput:
+    """Filter whole sequences, episode starts inside them included.
+
+    Eq. (8), (10), (12) [DRBPN] at every step.
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
+        previous_action: shape ``(*batch, time, action)``.
+        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, time, obs)``.
+        reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
+
+    Keyword Args:
+        use_stored_state: bool, shape ``(*batch, time)``; True takes the belief of the step before
+            from ``stored_mean`` instead of from the sequence.
+        stored_mean: shape ``(*batch, time, state)``; read where ``use_stored_state`` is True.
+        return_cov: whether the filtered covariances are wanted.
+        form: "auto" runs the native form where it can; "pytorch" and "native" force one.
+
+    Returns:
+        :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
+
+    Raises:
+        ValueError: for a wrong shape or dtype, if form="native" cannot run, or one of
+            ``use_stored_state`` and ``stored_mean`` is given without the other.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_drbpn.functional import TransitionMLP
+        >>> f = TransitionMLP((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...                    torch.zeros(2), eye)
+        >>> seen = torch.rand(4, 10, 2) < 0.7
+        >>> out = filter_sequence(model, torch.zeros(4, 2), torch.zeros(4, 10, 1),
+        ...                       torch.randn(4, 10, 2), seen, torch.zeros(4, 10, dtype=torch.bool))
+        >>> out.mean.shape, out.log_likelihood.shape
+        (torch.Size([4, 10, 2]), torch.Size([4, 10]))
+    """
+    if form not in ("auto", "pytorch", "native"):
+        raise ValueError(f"`form` must be 'auto', 'pytorch' or 'native', got {form!r}.")
+    if (use_stored_state is None) != (stored_mean is None):
+        raise ValueError(
+            "`use_stored_state` and `stored_mean` come together: the one says where, the other "
+            "from which belief."
+        )
+    batch, time = reset.shape[:-1], reset.shape[-1]
+    data = (
+        ("mean", mean, (*batch, model.state_dim)),
+        ("previous_action", previous_action, (*batch, time, model.action_dim)),
+        ("observation", observation, (*batch, time, model.obs_dim)),
+        ("stored_mean", stored_mean, (*batch, time, model.state_dim)),
+        ("use_stored_state", use_stored_state, (*batch, time)),
+    )
+    for name, value, shape in data:
+        if value is not None and value.shape != shape:
+            raise ValueError(
+                f"`{name}` must have shape {shape}, got {tuple(value.shape)}: `reset` "
+                f"{tuple(reset.shape)} says batch and time, the model the rest."
+            )
+    check_observed(observation, observed)
+
+    count = math.prod(batch)  # not -1: there may be no step at all
+
+    def rows(x: Tensor | None) -> Tensor | None:
+        return None if x is None else x.reshape(count, *x.shape[len(batch) :])
+
+    sequence: tuple[Any, ...] = tuple(
+        rows(x)
+        for x in (
+            observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
+        )
+    )  # fmt: skip
+    reason: str | None = "PyTorch was asked for"
+    if form != "pytorch":
+        reason = native.unsupported_reason(model, observation, previous_action, stored_mean, mean)
+        if form == "native" and reason is not None:
+            raise ValueError(f"`form` 'native' cannot run here: {reason}. Use form='auto'.")
+    with without_autocast(mean):
+        cov: Tensor | None
+        if reason is None:
+            filtered, ll = native.filter_rows(model, sequence)
+            cov = filtered_cov(model, observed, reset) if return_cov else None
+        elif isinstance(model.transition_cov, Tensor):
+            filtered, ll = _run(model, *sequence)
+            cov = filtered_cov(model, observed, reset) if return_cov else None
+        else:
+            filtered, covs, ll = _run_step_by_step(model, *sequence)
+            cov = covs.reshape(*batch, *covs.shape[1:]) if return_cov else None
+    return FilterOutput(
+        filtered.reshape(*batch, time, model.state_dim), cov, ll.reshape(*batch, time)
+    )
 
 
 def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
@@ -224,222 +248,143 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
         >>> torch.allclose(cov, torch.diag(torch.tensor([0.75, 1.0])))
         True
     """
-    zeros = torch.zeros_like(model.initial_mean).expand(*reset.shape, -1)
-    prior = initial_belief(model, reset.unsqueeze(-1), zeros, constant_cov(model))
-    nothing = torch.zeros((), dtype=zeros.dtype, device=zeros.device).expand(observed.shape)
-    H, R = model.emission_matrix, model.full_emission_cov()
-    return update(prior, nothing, observed, H, R).cov
+    cov = torch.where(reset[..., None, None], model.full_initial_cov(), model.constant_cov())
+    zero = torch.zeros((), dtype=cov.dtype, device=cov.device)
+    predicted = Belief(zero.expand(*reset.shape, model.state_dim), cov)
+    H, R = model.emission_matrix, model.emission_cov
+    return update(predicted, zero.expand(observed.shape), observed, H, R).cov
 
 
-def filter_sequence(
+# ------------------------------------------------------------------ the PyTorch form
+def _run(
     model: StateSpace,
-    mean: Tensor,
-    previous_action: Tensor,
     observation: Tensor,
     observed: Tensor,
+    action: Tensor,
     reset: Tensor,
-    *,
-    restart: Tensor | None = None,
-    restart_mean: Tensor | None = None,
-    return_cov: bool = False,
-    form: Form = "auto",
-) -> FilterOutput:
-    """Filter whole sequences, episode starts inside them included.
+    use_stored_state: Tensor | None,
+    stored_mean: Tensor | None,
+    mean: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Filter rows ``(batch, time, ...)``; return filtered means and log-likelihoods.
 
-    Eq. (8), (10), (12) [DRBPN] at every step. The fast forms equal the loop in values and
-    gradients; their own gradients cannot be differentiated again.
-
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
-        previous_action: shape ``(*batch, time, action)``.
-        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, time, obs)``.
-        reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
-
-    Keyword Args:
-        restart: bool, shape ``(*batch, time)``; True takes the belief of the step before from
-            ``restart_mean`` instead of from the sequence.
-        restart_mean: shape ``(*batch, time, state)``; read where ``restart`` is True.
-        return_cov: whether the filtered covariances are wanted.
-        form: "auto" chooses by dimension (:func:`choose_form`), in C where that runs;
-            "innovation", "information" (both in PyTorch), "native" (in C) and "loop" force one.
-
-    Returns:
-        :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
-
-    Raises:
-        ValueError: if the asked form does not fit the model or the machine, or one of ``restart``
-            and ``restart_mean`` is given without the other.
-
-    Example:
-        >>> import torch
-        >>> from torchrl_drbpn.functional import MeanNetwork
-        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...                    torch.zeros(2), eye)
-        >>> seen = torch.rand(4, 10, 2) < 0.7
-        >>> out = filter_sequence(model, torch.zeros(4, 2), torch.zeros(4, 10, 1),
-        ...                       torch.randn(4, 10, 2), seen, torch.zeros(4, 10, dtype=torch.bool))
-        >>> out.mean.shape, out.log_likelihood.shape
-        (torch.Size([4, 10, 2]), torch.Size([4, 10]))
+    In float64 but for the transition: with R at its floor float32 loses most digits of a gain.
     """
-    out, _ = _filter(
-        model, mean, previous_action, observation, observed, reset, restart, restart_mean, None,
-        return_cov, form,
-    )  # fmt: skip
-    return out
+    H, Q, P0 = (
+        x.double() for x in (model.emission_matrix, model.constant_cov(), model.full_initial_cov())
+    )
+    first = reset[..., None, None]
 
+    def every_step(f: Callable[[Tensor], Tensor]) -> Tensor:
+        return torch.where(first, f(P0), f(Q))
 
-def filter_followed(
-    model: StateSpace,
-    mean: Tensor,
-    previous_action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    following: Following,
-    *,
-    restart: Tensor | None = None,
-    restart_mean: Tensor | None = None,
-    return_cov: bool = False,
-    form: Form = "auto",
-) -> FollowedOutput:
-    """Filter sequences, and evaluate observations that follow some of their steps.
-
-    The same as :func:`filter_sequence`, and then one more step from the filtered means that
-    ``following`` names, in one pass where the C form runs.
-
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
-        previous_action: shape ``(*batch, time, action)``.
-        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, time, obs)``.
-        reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
-        following: observations that come after some of the steps and are no steps themselves.
-
-    Keyword Args:
-        restart: see :func:`filter_sequence`.
-        restart_mean: see there.
-        return_cov: see there.
-        form: see there.
-
-    Returns:
-        :class:`FollowedOutput`.
-
-    Raises:
-        ValueError: as :func:`filter_sequence`.
-
-    Example:
-        >>> import torch
-        >>> from torchrl_drbpn.functional import MeanNetwork
-        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...                    torch.zeros(2), eye)
-        >>> seen = torch.rand(4, 10, 2) < 0.7
-        >>> last = Following(
-        ...     torch.tensor([9, 39]), torch.zeros(2, 1), torch.randn(2, 2), seen[0, :2])
-        >>> out = filter_followed(model, torch.zeros(4, 2), torch.zeros(4, 10, 1),
-        ...                       torch.randn(4, 10, 2), seen, torch.zeros(4, 10, dtype=torch.bool),
-        ...                       last)
-        >>> out.following_log_likelihood.shape
-        torch.Size([2])
-    """
-    out, after = _filter(
-        model, mean, previous_action, observation, observed, reset, restart, restart_mean,
-        following, return_cov, form,
-    )  # fmt: skip
-    if after is None:  # it is no part of a longer pass: sequences of one step that go on
-        before = out.mean.reshape(-1, out.mean.shape[-1]).index_select(0, following.step)
-        action, x, seen = (value.unsqueeze(1) for value in following[1:])
-        goes_on = seen.new_zeros(len(before), 1)
-        after = out.log_likelihood.new_zeros(0)
-        if len(before):
-            last, _ = _filter(
-                model, before, action, x, seen, goes_on, None, None, None, False, form
-            )
-            after = last.log_likelihood.squeeze(1)
-    return FollowedOutput(*out, after)
-
-
-@outside_autocast
-def _filter(
-    model: StateSpace,
-    mean: Tensor,
-    previous_action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    restart: Tensor | None,
-    restart_mean: Tensor | None,
-    following: Following | None,
-    return_cov: bool,
-    form: Form,
-) -> tuple[FilterOutput, Tensor | None]:
-    """Run the chosen form; what follows is evaluated where it can go along, else None."""
-    chosen = checked_form(model, form)
-    check_observed(observation, observed)
-    if (restart is None) != (restart_mean is None):
-        raise ValueError(
-            "`restart` and `restart_mean` come together: restart says where, restart_mean says "
-            "from which belief."
-        )
-    batch, time = reset.shape[:-1], reset.shape[-1]
-    mean = mean.expand(*batch, mean.shape[-1])
-
-    if chosen == "native" or (chosen != "loop" and form == "auto"):
-        refusal = native_refusal(model, mean, previous_action, observation, restart_mean)
-        if refusal is None:
-            joined = following if _goes_along(following, observation) else None
-            filtered, ll, after = run_native(
-                model, mean, previous_action, observation, observed, reset, restart, restart_mean,
-                joined,
-            )  # fmt: skip
-            cov = filtered_cov(model, observed, reset) if return_cov else None
-            return FilterOutput(filtered, cov, ll), after
-        if chosen == "native":
-            raise ValueError(f"`form` 'native' cannot run here: {refusal}. Use form='auto'.")
-
-    def time_major(x: Tensor) -> Tensor:
-        """[*batch, time, dim] -> [time, batch, dim]."""
-        return x.reshape(-1, time, x.shape[-1]).transpose(0, 1)
-
-    def batch_major(x: Tensor) -> Tensor:
-        return x.transpose(0, 1).reshape(*batch, time, *x.shape[2:])
-
+    gains = _information if model.information_form else _innovation
+    gain, likelihood = gains(H, model.emission_cov.double(), every_step, observed)
     # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
-    x, a, seen = (
-        time_major(v) for v in (zero_missing(observation, observed), previous_action, observed)
-    )
-    first = time_major(reset.unsqueeze(-1))
-    again = None if restart is None else time_major(restart.unsqueeze(-1))
-    stored = None if restart_mean is None else time_major(restart_mean)
-    start = mean.reshape(-1, mean.shape[-1])
+    y = zero_missing(observation, observed).double() - model.offset(action).double()
+    predicted, moves, filtered = [], [], []
+    steps = (y, gain, action, reset.unsqueeze(-1), use_stored_state, stored_mean)
+    for y_t, gain_t, action_t, reset_t, use_t, stored_t in zip(
+        *((None,) * y.shape[1] if x is None else x.unbind(1) for x in steps), strict=True
+    ):
+        if use_t is not None:
+            mean = torch.where(use_t.unsqueeze(-1), stored_t, mean)
+        m = model.predicted_mean(mean, action_t, reset_t).double()
+        move = (gain_t @ (y_t - m @ H.mT).unsqueeze(-1)).squeeze(-1)
+        mean = (m + move).to(mean.dtype)
+        predicted.append(m)
+        moves.append(move)
+        filtered.append(mean)
+    if not filtered:
+        return mean.unsqueeze(1)[:, :0], y.sum(-1).to(mean.dtype)
+    residual = zero_missing(y - torch.stack(predicted, 1) @ H.mT, observed)
+    ll = likelihood(residual, torch.stack(moves, 1))
+    return torch.stack(filtered, 1), torch.where(observed.any(-1), ll, 0.0).to(mean.dtype)
 
-    covs: Tensor | None
-    if chosen == "loop":
-        filtered, covs, ll = run_loop(model, start, a, x, seen, first, again, stored)
-        covs = batch_major(covs) if return_cov else None
-    else:
-        run = run_innovation if chosen == "innovation" else run_information
-        filtered, ll = run(model, start, a, x, seen, first, again, stored)
-        ll = torch.where(seen.any(-1), ll, 0.0)
-        covs = filtered_cov(model, observed, reset) if return_cov else None
-    return FilterOutput(batch_major(filtered), covs, batch_major(ll)), None
+
+def _innovation(
+    H: Tensor, R: Tensor, every_step: EveryStep, observed: Tensor
+) -> tuple[Tensor, Callable[[Tensor, Tensor], Tensor]]:
+    """Return the gains K = P H' M' inv(M S M') M and the log-likelihood, obs x obs factorised."""
+    full_R = R.diag() if R.ndim == 1 else R
+    factor, log_det = _factor(masked_cov(every_step(lambda P: H @ P @ H.mT + full_R), observed))
+    cross = every_step(lambda P: H @ P)
+    gain = torch.cholesky_solve(zero_missing(cross, observed.unsqueeze(-1)), factor).mT
+
+    def likelihood(residual: Tensor, move: Tensor) -> Tensor:
+        del move
+        white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
+        count = observed.sum(-1).to(residual.dtype)  # an integer times a float would be float32
+        return -0.5 * (white.squeeze(-1).square().sum(-1) + log_det + count * LOG_2PI)
+
+    return gain, likelihood
 
 
-def _goes_along(following: Following | None, observation: Tensor) -> bool:
-    """Tell whether the C form takes it in the same call: no gradient reaches it there."""
-    return (
-        following is not None
-        and len(following.step) > 0
-        and all(
-            value.dtype == observation.dtype
-            and value.device == observation.device
-            and not value.requires_grad
-            for value in (following.observation, following.previous_action)
-        )
-    )
+def _information(
+    H: Tensor, R: Tensor, every_step: EveryStep, observed: Tensor
+) -> tuple[Tensor, Callable[[Tensor, Tensor], Tensor]]:
+    r"""Return the gains K = inv(inv(P) + H' W H) H' W and the log-likelihood, W = diag(m / r).
+
+    .. math::
+        v' S^{-1} v = (v - H \delta)' W (v - H \delta) + \delta' P^{-1} \delta, \qquad
+        \log|S| = \textstyle\sum_i m_i \log r_i + \log|P| + \log|P^{-1} + H' W H|
+
+    with :math:`\delta = K v`. Both terms of the quadratic form are sums of squares, so that nothing
+    cancels where R is small.
+    """
+    state = H.shape[-1]
+    weight = observed / R
+    outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
+    prior = every_step(lambda P: torch.cholesky_inverse(_factor(P)[0]))
+    gathered = (weight @ outer).view(*weight.shape[:-1], state, state)
+    factor, log_det = _factor(gathered + prior)
+    log_det = log_det + every_step(lambda P: _factor(P)[1][..., None, None]).flatten(-3)
+    gain = torch.cholesky_solve((weight.unsqueeze(-1) * H).mT, factor)
+
+    def likelihood(residual: Tensor, move: Tensor) -> Tensor:
+        left = zero_missing(residual - move @ H.mT, observed)
+        by_prior = (prior @ move.unsqueeze(-1)).squeeze(-1)
+        quadratic = (weight * left.square()).sum(-1) + (move * by_prior).sum(-1)
+        log_noise = observed.to(R.dtype) @ (R.log() + LOG_2PI)
+        return -0.5 * (quadratic + log_noise + log_det)
+
+    return gain, likelihood
+
+
+def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return Cholesky factor and log-determinant; NaN for a matrix that has none, by itself."""
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    spoilt = torch.where(info == 0, 0.0, torch.nan).to(matrix.dtype)[..., None, None]
+    factor = factor + spoilt
+    return factor, 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def _run_step_by_step(
+    model: StateSpace,
+    observation: Tensor,
+    observed: Tensor,
+    action: Tensor,
+    reset: Tensor,
+    use_stored_state: Tensor | None,
+    stored_mean: Tensor | None,
+    mean: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Filter by :mod:`.kalman` at every step; return means, covariances, log-likelihoods."""
+    H, R, offset = model.emission_matrix, model.emission_cov, model.offset(action)
+    means, covs, lls = [], [], []
+    for t in range(reset.shape[1]):
+        if use_stored_state is not None and stored_mean is not None:
+            mean = torch.where(use_stored_state[:, t, None], stored_mean[:, t], mean)
+        predicted = predict_step(model, mean, action[:, t], reset[:, t])
+        step = (observation[:, t], observed[:, t], H, R, offset[:, t])
+        lls.append(log_likelihood(predicted, *step))
+        mean, cov = update(predicted, *step)
+        means.append(mean)
+        covs.append(cov)
+    if not means:
+        nothing = mean.unsqueeze(1)[:, :0]
+        return nothing, nothing.unsqueeze(-1) * nothing.unsqueeze(-2), nothing.sum(-1)
+    return torch.stack(means, 1), torch.stack(covs, 1), torch.stack(lls, 1)
+
+
+native.register_gradient(_run)

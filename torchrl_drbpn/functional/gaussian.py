@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import torch
@@ -11,13 +12,16 @@ from torch.nn.functional import softplus
 
 __all__ = [
     "Belief",
+    "as_matrix",
     "check_observed",
+    "factorise",
     "full_cov",
     "inverse_softplus",
     "masked_cov",
     "masked_log_density",
     "positive_std",
     "tril_to_vector",
+    "without_autocast",
     "zero_missing",
 ]
 
@@ -61,6 +65,63 @@ def check_observed(observation: Tensor, observed: Tensor) -> None:
             f"`observed` must be bool of the observation's shape {tuple(observation.shape)}, got "
             f"{observed.dtype} {tuple(observed.shape)}. One entry a component: True = arrived."
         )
+
+
+def as_matrix(name: str, cov: Tensor, dim: int) -> Tensor:
+    """Return a covariance as a matrix; variances become its diagonal, never a broadcast row.
+
+    Args:
+        name: of the argument, for the error.
+        cov: shape ``(*batch, dim, dim)``, or ``(dim,)`` for the variances of a diagonal one.
+        dim: number of components.
+
+    Returns:
+        Shape ``(*batch, dim, dim)``.
+
+    Raises:
+        ValueError: for any other shape.
+
+    Example:
+        >>> import torch
+        >>> as_matrix("emission_cov", torch.tensor([1.0, 2.0]), 2).tolist()
+        [[1.0, 0.0], [0.0, 2.0]]
+    """
+    if cov.shape[-2:] == (dim, dim):
+        return cov
+    if cov.shape == (dim,):
+        return torch.diag_embed(cov)
+    raise ValueError(
+        f"`{name}` must be a covariance of shape (..., {dim}, {dim}) or the variances ({dim},) of "
+        f"a diagonal one, got {tuple(cov.shape)}."
+    )
+
+
+def factorise(name: str, cov: Tensor) -> Tensor:
+    """Return the lower Cholesky factor of a covariance, or say that it has none.
+
+    Args:
+        name: what the covariance is, for the error.
+        cov: shape ``(*batch, dim, dim)``.
+
+    Returns:
+        Shape ``(*batch, dim, dim)``.
+
+    Raises:
+        ValueError: if a matrix of the batch is not positive definite.
+
+    Example:
+        >>> import torch
+        >>> factorise("S", 4 * torch.eye(2)).tolist()
+        [[2.0, 0.0], [0.0, 2.0]]
+    """
+    try:
+        return torch.linalg.cholesky(cov)
+    except RuntimeError as error:  # LinAlgError, which torch.linalg does not export by name
+        raise ValueError(
+            f"{name} is not positive definite: a covariance is singular or holds NaN. Two sensors "
+            "that read the same quantity without noise (R = 0) are such a case: give R a positive "
+            "variance."
+        ) from error
 
 
 def zero_missing(values: Tensor, observed: Tensor) -> Tensor:
@@ -133,7 +194,7 @@ def masked_log_density(residual: Tensor, cov: Tensor, observed: Tensor) -> Tenso
         True
     """
     residual = zero_missing(residual, observed)
-    factor = torch.linalg.cholesky(masked_cov(cov, observed))
+    factor = factorise("`cov`", masked_cov(cov, observed))
     white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
     log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     count = observed.sum(-1).to(residual.dtype)
@@ -220,3 +281,25 @@ def tril_to_vector(cov: Tensor) -> Tensor:
     """
     row, column = torch.tril_indices(cov.shape[-1], cov.shape[-1], device=cov.device)
     return cov[..., row, column]
+
+
+def without_autocast(like: Tensor) -> AbstractContextManager[None]:
+    """Keep the dtypes of tensors inside torch.autocast: half precision loses a filter's digits.
+
+    Args:
+        like: a tensor on the device that computes.
+
+    Returns:
+        A context manager that costs nothing outside torch.autocast.
+
+    Example:
+        >>> import torch
+        >>> x = torch.eye(2)
+        >>> with torch.autocast("cpu", dtype=torch.bfloat16), without_autocast(x):
+        ...     (x @ x).dtype
+        torch.float32
+    """
+    kind = like.device.type
+    if kind == "meta" or not torch.is_autocast_enabled(kind):
+        return nullcontext()
+    return torch.autocast(kind, enabled=False)

@@ -3,7 +3,8 @@
 These functions are the truth to which the fast sequence filter (:mod:`.filtering`) is held. They
 take any mask and any leading batch shape; nothing is inverted explicitly. Inside a function the
 book's letters stand for: m, P the belief, H the emission matrix, R the emission covariance,
-S the innovation covariance, K the gain.
+S the innovation covariance, K the gain. A covariance is a matrix or, of shape ``(n,)``, the
+variances of a diagonal one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import (
     Belief,
+    as_matrix,
     check_observed,
+    factorise,
     masked_cov,
     masked_log_density,
     zero_missing,
@@ -30,7 +33,7 @@ def predict(
     transition_cov: Tensor,
     previous_action: Tensor,
     *,
-    jacobian: Tensor | None = None,
+    jacobian: Tensor | None,
 ) -> Belief:
     r"""Carry a filtered belief over one transition.
 
@@ -43,13 +46,14 @@ def predict(
     Args:
         belief: filtered belief of the step before, mean ``(*batch, state)``.
         transition: f, maps ``(*batch, state)`` and ``(*batch, action)`` to ``(*batch, state)``.
-        transition_cov: Q, shape ``(*batch, state, state)`` or ``(state, state)``.
+        transition_cov: Q, shape ``(*batch, state, state)``, or ``(state,)`` for its diagonal.
         previous_action: shape ``(*batch, action)``.
 
     Keyword Args:
-        jacobian: J, the derivative of f by the mean, shape ``(*batch, state, state)``; None (the
-            paper) drops the past covariance. A Q that was trained without it holds the past's share
-            already: propagating it afterwards would count that twice.
+        jacobian: J, the derivative of f by the mean, shape ``(*batch, state, state)``, to propagate
+            the covariance; None for the constant one of the paper, which drops the past. A Q that
+            was trained without it holds the past's share already: propagating it afterwards would
+            count that twice.
 
     Returns:
         The predicted belief.
@@ -57,15 +61,36 @@ def predict(
     Example:
         >>> import torch
         >>> belief = Belief(torch.ones(5, 2), torch.eye(2).expand(5, 2, 2))
-        >>> predicted = predict(belief, lambda m, a: m + a, 0.1 * torch.eye(2), torch.ones(5, 2))
+        >>> predicted = predict(
+        ...     belief, lambda m, a: m + a, 0.1 * torch.eye(2), torch.ones(5, 2), jacobian=None)
         >>> bool((predicted.mean == 2).all()), predicted.cov.shape
         (True, torch.Size([5, 2, 2]))
     """
     mean = transition(belief.mean, previous_action)
+    Q = as_matrix("transition_cov", transition_cov, mean.shape[-1])
     if jacobian is None:
-        return Belief(mean, transition_cov.expand(*mean.shape, mean.shape[-1]))
-    moved = jacobian @ belief.cov @ jacobian.mT
-    return Belief(mean, 0.5 * (moved + moved.mT) + transition_cov)
+        return Belief(mean, Q.expand(*mean.shape, mean.shape[-1]))
+    moved = jacobian @ as_matrix("belief.cov", belief.cov, mean.shape[-1]) @ jacobian.mT
+    return Belief(mean, 0.5 * (moved + moved.mT) + Q)
+
+
+def _covariances(
+    belief: Belief, observation: Tensor, observed: Tensor, H: Tensor, R: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Check the sizes of an update; return H, P and R as float64 matrices.
+
+    float64 whatever the dtype: with R at its floor beside a large P, S has a condition number of
+    1e6 and more, and the two terms of an updated covariance cancel along measured directions.
+    """
+    check_observed(observation, observed)
+    obs, state = observation.shape[-1], belief.mean.shape[-1]
+    if H.shape[-2:] != (obs, state):
+        raise ValueError(
+            f"`emission_matrix` must have shape (obs, state) = {(obs, state)}, got "
+            f"{tuple(H.shape)}: `observation` and `belief.mean` say the sizes."
+        )
+    P, R = as_matrix("belief.cov", belief.cov, state), as_matrix("emission_cov", R, obs)
+    return H.double(), P.double(), R.double()
 
 
 def innovation(
@@ -85,7 +110,7 @@ def innovation(
         observation: x, shape ``(*batch, obs)``; missing entries may hold anything.
         observed: bool, shape ``(*batch, obs)``.
         emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(obs, obs)``.
+        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for its diagonal.
         offset: o = B a + d, shape ``(*batch, obs)``; None is 0.
 
     Returns:
@@ -101,14 +126,18 @@ def innovation(
         >>> v.tolist(), S.diagonal().tolist()
         ([1.0, 0.0], [2.0, 2.0])
     """
-    check_observed(observation, observed)
-    H = emission_matrix.double()
-    expected = belief.mean.double() @ H.mT
+    H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov)
+    expected = (H @ belief.mean.double().unsqueeze(-1)).squeeze(-1)
     if offset is not None:
+        if offset.shape[-1:] != observation.shape[-1:]:
+            raise ValueError(
+                f"`offset` must have shape (*batch, obs) = {tuple(observation.shape)}, got "
+                f"{tuple(offset.shape)}."
+            )
         expected = expected + offset
     # Zero first, subtract after: a NaN under a False mask must reach neither value nor gradient.
     residual = zero_missing(zero_missing(observation, observed) - expected, observed)
-    return Belief(residual, H @ belief.cov.double() @ H.mT + emission_cov)
+    return Belief(residual, H @ P @ H.mT + R)
 
 
 def update(
@@ -134,7 +163,7 @@ def update(
         observation: shape ``(*batch, obs)``; missing entries may hold anything.
         observed: bool, shape ``(*batch, obs)``.
         emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(obs, obs)``.
+        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for its diagonal.
         offset: B a + d, shape ``(*batch, obs)``; None is 0.
 
     Returns:
@@ -149,12 +178,10 @@ def update(
         >>> mean.tolist(), torch.allclose(cov, expected)
         ([0.25, 0.0], True)
     """
-    # In float64 whatever the dtype, as the innovation is: the two terms of the covariance cancel
-    # along measured directions.
     dtype = belief.mean.dtype
-    H, P, R = (x.double() for x in (emission_matrix, belief.cov, emission_cov))
+    H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov)
     v, S = innovation(belief, observation, observed, H, R, offset)
-    factor = torch.linalg.cholesky(masked_cov(S, observed))
+    factor = factorise("the innovation covariance H P H' + R", masked_cov(S, observed))
     # K' = A^-1 (M'M) H P: the rows of missing entries are zero, so K ignores them.
     cross = zero_missing(H @ P, observed.unsqueeze(-1))
     K = torch.cholesky_solve(cross, factor).mT
@@ -168,7 +195,7 @@ def update(
     unit = 0.5 * cov.shape[-1] * torch.finfo(cov.dtype).eps
     cov = cov + torch.diag_embed(unit * cov.diagonal(dim1=-2, dim2=-1).detach())
     anything = observed.any(-1)[..., None, None]
-    return Belief(mean, torch.where(anything, cov, belief.cov))
+    return Belief(mean, torch.where(anything, cov, P.to(dtype)))
 
 
 def log_likelihood(
@@ -190,7 +217,7 @@ def log_likelihood(
         observation: shape ``(*batch, obs)``; missing entries may hold anything.
         observed: bool, shape ``(*batch, obs)``.
         emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(obs, obs)``.
+        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for its diagonal.
         offset: B a + d, shape ``(*batch, obs)``; None is 0.
 
     Returns:

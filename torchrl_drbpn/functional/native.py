@@ -1,38 +1,79 @@
-"""The fast forms in C: one call forward and one back, not some hundred operations each.
+"""The native form of the filter: one operator on the CPU, forward and back.
 
 At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
-time between the operations of the filter, not in them. ``native.c`` and the files that it includes
-hold the same sums as :class:`~torchrl_drbpn.functional.recurrence.InnovationRecurrence` and
-:class:`~torchrl_drbpn.functional.recurrence.InformationRecurrence` and are held to their oracles.
-:mod:`.compiled` compiles it; where it cannot, the PyTorch forms run.
+time between the operations of the filter, not in them. ``csrc/filter.h`` holds the same sums; the
+package is built with it. ``torch.ops.torchrl_drbpn.filter_rows`` and its gradient check every
+tensor before they hand over a pointer; FakeTensors, tracing and vmap meet an ordinary operator.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import functools
+import itertools
+import warnings
+from collections.abc import Callable, Sequence
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch.autograd import forward_ad
 
-from torchrl_drbpn.functional.compiled import load_library, native_error
-from torchrl_drbpn.functional.model import StateSpace, choose_form
-from torchrl_drbpn.functional.recurrence import MeanNetwork
+from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
 
-__all__ = ["NativeRecurrence", "filter_rows", "native_refusal"]
+__all__ = ["filter_rows", "native_status", "register_gradient", "unsupported_reason"]
 
-_CPU = torch.device("cpu")
+_KINDS = {torch.float32: "float", torch.float64: "double"}
+_WIDTHS = {"AVX512": "avx512", "AVX2": "avx2"}
 _MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
 _MAX_LAYERS = 15
+_LANES = 8  # doubles in a vector; memory.h pads every row to whole ones
 
 
-def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
-    """Say why the C form does not take this model and these inputs.
+@functools.cache
+def _library() -> ctypes.CDLL | str:
+    """Load what the build made for this processor; the reason where there is nothing."""
+    width = _WIDTHS.get(torch.backends.cpu.get_cpu_capability(), "baseline")
+    folder = Path(__file__).parents[1]
+    for name, suffix in itertools.product((width, "baseline"), EXTENSION_SUFFIXES):
+        path = folder / f"_native_{name}{suffix}"
+        if path.is_file():
+            try:
+                return ctypes.CDLL(str(path))
+            except OSError as error:
+                return f"{path.name} cannot be loaded: {error}"
+    return (
+        "the package was built without it: install a C compiler, then the package again "
+        "(in a checkout: python setup.py build_ext --inplace)"
+    )
+
+
+def native_status() -> str | None:
+    """Say why the native form of the filter cannot run on this machine.
+
+    Returns:
+        None where it can, else the reason: the PyTorch form runs instead.
+
+    Example:
+        >>> type(native_status()) in (type(None), str)
+        True
+    """
+    library = _library()
+    return library if isinstance(library, str) else None
+
+
+@functools.cache
+def _warn_once(reason: str) -> None:
+    warnings.warn(f"the filter runs in PyTorch, several times slower: {reason}.", stacklevel=2)
+
+
+def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None:
+    """Say why the native form does not take this model and these inputs.
 
     Args:
-        model: a model that the innovation or the information form takes.
+        model: the state-space model.
         tensors: the inputs of the filter that hold numbers.
 
     Returns:
@@ -40,194 +81,340 @@ def native_refusal(model: StateSpace, *tensors: Tensor | None) -> str | None:
 
     Example:
         >>> import torch
-        >>> f = MeanNetwork((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
+        >>> f = TransitionMLP((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
         >>> eye = torch.eye(2)
         >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
         ...                    torch.zeros(2), eye)
-        >>> native_refusal(model, torch.zeros(2).double())
+        >>> unsupported_reason(model, torch.zeros(2).double())
         'the dtypes differ'
     """
-    dtype = model.initial_mean.dtype
-    obs, state = model.emission_matrix.shape
-    assert isinstance(model.transition, MeanNetwork)  # as the innovation form demands
-    every = [*model.transition.weights, *model.transition.biases, *model[1:], *tensors]
-    given = [x for x in every if isinstance(x, Tensor)]
+    f, Q = model.transition, model.transition_cov
+    if not isinstance(f, TransitionMLP) or not isinstance(Q, Tensor):
+        return "it takes a TransitionMLP with a constant transition_cov"
+    given = [x for x in (*_model_tensors(model, f, Q), *tensors) if x is not None]
     if torch.compiler.is_compiling():
-        return "torch.compile traces PyTorch's operations"
+        return "torch.compile and torch.export trace PyTorch's operations"
+    # functorch has no public word for "a transformation is running", and a tensor under one looks
+    # like any other.
     if torch._C._are_functorch_transforms_active():
         return "torch.func transforms PyTorch's operations"
-    if {x.device for x in given} != {_CPU}:
-        return "it runs on the CPU"
-    if {x.dtype for x in given} != {dtype}:
-        return "the dtypes differ"
-    size = state if choose_form(model) == "information" else obs
+    # A new object comes back inside a forward-mode level, where tensors may carry tangents.
+    dual = forward_ad.unpack_dual(given[0])  # type: ignore[no-untyped-call]
+    if dual.primal is not given[0]:
+        return "it has no forward-mode derivative"
+    for x in given:
+        if type(x) is not Tensor and type(x) is not torch.nn.Parameter:
+            return f"{type(x).__name__} is a class of its own"
+        if not x.is_cpu:
+            return "it runs on the CPU"
+        if x.dtype != given[0].dtype:
+            return "the dtypes differ"
+    if given[0].dtype not in _KINDS:
+        return f"there is none for {given[0].dtype}"
+    size, name = (model.state_dim, "state") if model.information_form else (model.obs_dim, "obs")
     if size > _MAX_SIZE:
-        return f"{'obs' if size == obs else 'state'} is {size}, more than {_MAX_SIZE}"
-    if len(model.transition.weights) > _MAX_LAYERS:
+        return f"{name} is {size}, more than {_MAX_SIZE}"
+    if len(f.weights) > _MAX_LAYERS:
         return f"the transition has more than {_MAX_LAYERS} layers"
-    return native_error(dtype)
+    if any(x.numel() == 0 for x in given):
+        return "there is nothing to filter"
+    reason = native_status()
+    if reason is not None:
+        _warn_once(reason)
+    return reason
 
 
-def _call(function: Any, dims: Any, tensors: list[Tensor | None]) -> None:
-    pointers = [None if x is None else x.data_ptr() for x in tensors]
-    function(dims, (ctypes.c_void_p * len(pointers))(*pointers))
+def _model_tensors(model: StateSpace, f: TransitionMLP, Q: Tensor) -> list[Tensor]:
+    """Return the model as the operator takes it: seven tensors, then weight, bias, ..."""
+    return [
+        Q, model.initial_cov, model.emission_cov, model.emission_matrix, model.action_matrix,
+        model.emission_offset, model.initial_mean,
+        *itertools.chain.from_iterable(zip(f.weights, f.biases, strict=True)),
+    ]  # fmt: skip
 
 
-class NativeRecurrence(torch.autograd.Function):
-    """Filter mean and log-likelihood of whole sequences by ``native.c``, batch first.
-
-    Inputs: whether it is the information form, residual, activation, what follows (a
-    :class:`.Following` without gradients, or None), observation, observed, previous action, reset,
-    restart, stored mean, start, Q, initial covariance, R, H, B, d, initial mean, then the weight
-    and the bias of each layer. All contiguous, one dtype, on the CPU. The information form takes
-    the inverses of Q and of the initial covariance in their places, in float64, leaves their
-    log-determinant out of the likelihood, and takes nothing observed for no special case.
-
-    What follows is a second pass, over sequences of one step: here it shares one node of the graph
-    and one sum of the gradients by the model with the first, which is most of what it costs.
-
-    It computes in float64 whatever it is given, and likelihoods come out in float64.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, *args: Any) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return mean (batch, time, state) and log-likelihoods (batch, time), (count,)."""
-        information, residual, activation, following, *rest = args
-        settings, sequence, model = (information, residual, activation), rest[:7], rest[7:]
-        first, mean, ll, tape = _ahead(settings, sequence, model)
-        ctx.passes = [first]
-        kept = [*sequence[1:5:2], sequence[4], tape]
-        of_following = None
-        if following is not None:
-            start = mean.flatten(0, 1).index_select(0, following.step)
-            x, observed, action = (
-                value.unsqueeze(1).contiguous()
-                for value in (following.observation, following.observed, following.previous_action)
-            )
-            goes_on = observed.new_zeros(len(start), 1)
-            after = (x, observed, action, goes_on, None, None, start)
-            second, _, ll_after, tape = _ahead(settings, after, model)
-            ctx.passes.append(second)
-            kept += [following.step, observed, goes_on, tape]
-            of_following = ll_after.squeeze(1)
-        ctx.save_for_backward(*kept, *model)
-        ctx.set_materialize_grads(False)
-        return mean, ll, of_following
-
-    @staticmethod
-    @once_differentiable
-    def backward(
-        ctx: Any, g_mean: Tensor | None, g_ll: Tensor | None, g_following: Tensor | None = None
-    ) -> tuple[Tensor | None, ...]:
-        """Return the gradient of every input of ``forward``, in its order."""
-        saved, of_following = ctx.saved_tensors, None
-        observed, reset, restart, tape = saved[:4]
-        model = saved[4:] if len(ctx.passes) == 1 else saved[8:]
-        if g_following is not None:
-            step, after_observed, goes_on, after_tape = saved[4:8]
-            (*_, g_after), of_following = _back(
-                ctx.passes[1], (False, False, False, True), None, g_following,
-                (after_observed, goes_on, None, after_tape), model,
-            )  # fmt: skip
-            rows, state = reset.numel(), len(model[6])
-            flat = (
-                model[6].new_zeros(rows, state) if g_mean is None else g_mean.reshape(rows, state)
-            )
-            if g_after is not None:  # it was asked for; for the type checker
-                g_mean = flat.index_add(0, step, g_after).view(*reset.shape, state)
-        wanted = ctx.needs_input_grad
-        (g_x, g_action, g_stored, g_start), of_model = _back(
-            ctx.passes[0], (wanted[4], wanted[6], wanted[9], wanted[10]), g_mean, g_ll,
-            (observed, reset, restart, tape), model,
-        )  # fmt: skip
-        if of_following is not None:
-            torch._foreach_add_(of_model, of_following)
-        return (
-            None, None, None, None, g_x, None, g_action, None, None, g_stored, g_start, *of_model,
-        )  # fmt: skip
-
-
-def filter_rows(
-    settings: tuple[bool, bool, str], sequence: Sequence[Any], model: Sequence[Tensor]
-) -> tuple[Tensor, Tensor]:
-    """Return mean and log-likelihood without a graph: a decision needs none.
+def filter_rows(model: StateSpace, sequence: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
+    """Filter rows of sequences by the operator.
 
     Args:
-        settings: the first three inputs of :class:`NativeRecurrence`.
-        sequence: its inputs from the observation to the start.
-        model: its inputs from Q on.
+        model: a model that :func:`unsupported_reason` has nothing against.
+        sequence: observation, observed, previous action, reset, use_stored_state, stored_mean (both
+            may be None), each ``(batch, time, ...)``, and the mean ``(batch, state)`` before.
 
     Returns:
-        Shapes ``(batch, time, state)`` and ``(batch, time)``.
+        Filtered means ``(batch, time, state)`` and log-likelihoods ``(batch, time)``.
+
+    Example:
+        >>> import torch
+        >>> f = TransitionMLP((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...                    torch.zeros(2), eye)
+        >>> no = torch.zeros(4, 3, dtype=torch.bool)
+        >>> rows = (torch.zeros(4, 3, 2), no.unsqueeze(-1).expand(4, 3, 2), torch.zeros(4, 3, 1),
+        ...         no, None, None, torch.ones(4, 2))
+        >>> native_status() is not None or bool((filter_rows(model, rows)[0] == 1).all())
+        True
     """
-    _, mean, ll, _ = _ahead(settings, sequence, model)
-    return mean, ll
-
-
-class _Pass(NamedTuple):
-    """Hold the sizes of a pass as native_memory.h reads them, and how much its reverse needs."""
-
-    dims: ctypes.Array[ctypes.c_int64]
-    shape: tuple[int, int, int, int, int]
-    scratch: int
-
-
-def _ahead(
-    settings: tuple[bool, bool, str], sequence: Sequence[Any], model: Sequence[Tensor]
-) -> tuple[_Pass, Tensor, Tensor, Tensor]:
-    """Filter sequences; return mean, log-likelihood and tape."""
-    information, residual, activation = settings
-    x, observed, action, reset, restart, stored, start = sequence
-    (batch, time, obs), state = x.shape, start.shape[-1]
-    widths = [weight.shape[0] for weight in model[7::2]]
-    numbers = [
-        batch, time, obs, state, action.shape[-1], len(widths), residual, activation == "relu",
-        model[2].ndim == 2, start.stride(0), information, *widths,
-    ]  # fmt: skip
-    dims = (ctypes.c_int64 * len(numbers))(*numbers)
-    library = load_library(x.dtype)
-    counts = (ctypes.c_int64 * 3)()
-    library.sizes(dims, counts)
-    tape, scratch = (x.new_empty(count, dtype=torch.float64) for count in counts[:2])
-    ll = x.new_empty(batch, time, dtype=torch.float64)
-    mean = x.new_empty(batch, time, state)
-    _call(
-        library.forward,
-        dims,
-        [
-            x, observed, action, reset, restart, stored, start, *model[:7], mean, ll, tape, scratch,
-            *model[7:],
-        ],
-    )  # fmt: skip
-    shape = (batch, time, obs, state, action.shape[-1])
-    return _Pass(dims, shape, counts[2]), mean, ll, tape
-
-
-def _back(
-    of: _Pass,
-    wanted: Sequence[bool],
-    g_mean: Tensor | None,
-    g_ll: Tensor | None,
-    kept: Sequence[Any],
-    model: Sequence[Tensor],
-) -> tuple[tuple[Tensor | None, ...], list[Tensor]]:
-    """Return the gradients by observation, action, stored mean and start, and by the model."""
-    observed, reset, restart, tape = kept
-    Q, initial_cov, R, H, B, _, _, *layers = model
-    batch, time, obs, state, actions = of.shape
-    shapes = ((batch, time, obs), (batch, time, actions), (batch, time, state), (batch, state))
-    by_inputs = tuple(
-        H.new_empty(shape) if asked else None for shape, asked in zip(shapes, wanted, strict=True)
+    f = model.transition
+    assert isinstance(f, TransitionMLP)  # the rule saw to it; for the type checker
+    tensors = _model_tensors(model, f, model.constant_cov())
+    tensors[1] = model.full_initial_cov()
+    mean, log_likelihood, _ = torch.ops.torchrl_drbpn.filter_rows(
+        *sequence, tensors, f.residual, f.activation == "tanh"
     )
-    by_model = [torch.empty_like(value) for value in model]
-    _call(
-        load_library(H.dtype).backward,
-        of.dims,
+    return mean, log_likelihood
+
+
+# ------------------------------------------------------------------ the operator
+_SEQUENCE = (
+    "Tensor observation, Tensor observed, Tensor action, Tensor reset, Tensor? use_stored, "
+    "Tensor? stored, Tensor start"
+)
+_LIBRARY: Any = torch.library.Library("torchrl_drbpn", "DEF")  # type: ignore[no-untyped-call]
+_LIBRARY.define(
+    f"filter_rows({_SEQUENCE}, Tensor[] model, bool residual, bool tanh) "
+    "-> (Tensor, Tensor, Tensor)"
+)
+_LIBRARY.define(
+    f"filter_rows_backward(Tensor? by_mean, Tensor? by_log_likelihood, Tensor tape, {_SEQUENCE}, "
+    "Tensor[] model, bool residual, bool tanh) -> Tensor[]"
+)
+
+
+class _Sizes:
+    """Check the tensors of a call, and hold its sizes as memory.h reads them."""
+
+    def __init__(
+        self, sequence: Sequence[Tensor | None], model: Sequence[Tensor], flags: tuple[bool, bool]
+    ) -> None:
+        observation, _, action, _, use_stored, stored, start = sequence
+        if len(model) < 9 or len(model) % 2 == 0:
+            raise ValueError(f"`model` must hold 7 tensors and layers of two, got {len(model)}.")
+        if observation is None or action is None or start is None:
+            raise ValueError("only `use_stored` and `stored` may be None.")
+        if observation.ndim != 3 or action.ndim != 3 or start.ndim != 2:
+            raise ValueError(
+                "`observation` and `action` must be (batch, time, n), `start` (batch, n)."
+            )
+        batch, time, obs = observation.shape
+        state, self.actions = start.shape[1], action.shape[2]
+        R = model[2]
+        widths = [state + self.actions, *(len(bias) for bias in model[8::2])]
+        self.information = R.ndim == 1 and obs > state
+        shapes: list[tuple[int, ...]] = [
+            (batch, time, obs), (batch, time, obs), (batch, time, self.actions), (batch, time),
+            (batch, time), (batch, time, state), (batch, state), (state, state), (state, state),
+            (obs,) * min(2, max(1, R.ndim)), (obs, state), (obs, self.actions), (obs,), (state,),
+        ]  # fmt: skip
+        for fan_in, fan_out in itertools.pairwise(widths):
+            shapes += [(fan_out, fan_in), (fan_out,)]
+        every = [*sequence, *model]
+        self.dtype = observation.dtype
+        for i, (x, shape) in enumerate(zip(every, shapes, strict=True)):
+            dtype = torch.bool if i in (1, 3, 4) else self.dtype
+            if x is not None and (x.shape != shape or x.dtype != dtype or x.device != start.device):
+                raise ValueError(
+                    f"tensor {i} must be {dtype} of shape {shape} on {start.device}, got {x.dtype} "
+                    f"{tuple(x.shape)} on {x.device}."
+                )
+        size = state if self.information else obs
+        if (
+            self.dtype not in _KINDS
+            or widths[-1] != state
+            or (use_stored is None) != (stored is None)
+        ):
+            raise ValueError("float32 or float64, f of width state, `use_stored` beside `stored`.")
+        if size > _MAX_SIZE or len(widths) > _MAX_LAYERS + 1 or not all(map(min, shapes)):
+            raise ValueError(f"no size may be 0, none factorised over {_MAX_SIZE}; got {shapes}.")
+        self.batch, self.time, self.obs, self.state = batch, time, obs, state
+        self.numbers = [
+            batch, time, obs, state, self.actions, len(widths) - 1, flags[0], not flags[1],
+            R.ndim == 2, state, self.information, *widths[1:],
+        ]  # fmt: skip
+        N, S, J, *W = map(_padded, (obs, state, *widths))
+        entries = state * (state + 1) // 2 if self.information else obs * obs
+        beside = batch * time * S if self.information else 2 * (state * N + obs * S)
+        rows = batch * time
+        self.tape = rows * (2 * J + N + sum(W[:-1])) + _padded(rows) * entries + beside
+
+    def call(self, name: str, pointers: Sequence[Tensor | None], scratch_at: int) -> None:
+        """Call a function of the library; a scratch of the size it asks for goes in between."""
+        library = _library()
+        if isinstance(library, str):
+            raise RuntimeError(f"the native filter cannot run: {library}.")
+        kind = _KINDS[self.dtype]
+        dims = (ctypes.c_int64 * len(self.numbers))(*self.numbers)
+        counts = (ctypes.c_int64 * 3)()
+        getattr(library, f"sizes_{kind}")(dims, counts)
+        scratch = torch.empty(counts[1 + (name == "backward")], dtype=torch.float64)
+        every = [*pointers[:scratch_at], scratch, *pointers[scratch_at:]]
+        found = (ctypes.c_void_p * len(every))(
+            *(None if x is None else x.data_ptr() for x in every)
+        )
+        getattr(library, f"{name}_{kind}")(dims, found)
+
+
+def _padded(n: int) -> int:
+    return (n + _LANES - 1) // _LANES * _LANES
+
+
+def _dense(tensors: Sequence[Tensor | None]) -> list[Any]:
+    return [None if x is None else x.contiguous() for x in tensors]
+
+
+def _inverses(sizes: _Sizes, model: Sequence[Tensor]) -> tuple[list[Tensor], Tensor | None]:
+    """Return what C takes for Q and P_0, and log|Q|, log|P_0| in the information form."""
+    if not sizes.information:
+        return list(model[:2]), None
+    factor, _ = torch.linalg.cholesky_ex(torch.stack(list(model[:2])).double())
+    inverse = torch.cholesky_inverse(factor)
+    return list(inverse), 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def _forward(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
+    sequence, model, flags = _dense(args[:7]), _dense(args[7]), args[8:]
+    sizes = _Sizes(sequence, model, flags)
+    x, observed, _, reset, *_ = sequence
+    mean = x.new_empty(sizes.batch, sizes.time, sizes.state)
+    ll = x.new_empty(sizes.batch, sizes.time, dtype=torch.float64)
+    tape = x.new_empty(sizes.tape, dtype=torch.float64)
+    priors, log_det = _inverses(sizes, model)
+    sizes.call("forward", [*sequence, *priors, *model[2:7], mean, ll, tape, *model[7:]], 17)
+    if log_det is not None:
+        ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
+        ll = torch.where(observed.any(-1), ll, 0.0)
+    return mean, ll.to(x.dtype), tape
+
+
+def _backward(*args: Any) -> list[Tensor]:
+    """Return the gradients by observation, action, stored mean, start and each of the model."""
+    by_mean, by_ll, tape, *_ = args
+    sequence, model, flags = _dense(args[3:10]), _dense(args[10]), args[11:]
+    sizes = _Sizes(sequence, model, flags)
+    x, observed, action, reset, use_stored, stored, start = sequence
+    if tape.shape != (sizes.tape,) or tape.dtype != torch.float64 or not tape.is_contiguous():
+        raise ValueError("`tape` must be what filter_rows returned for the same inputs.")
+    for by, shape in ((by_mean, (*reset.shape, sizes.state)), (by_ll, reset.shape)):
+        if by is not None and (by.shape != shape or by.dtype != x.dtype):
+            raise ValueError("`by_mean` and `by_log_likelihood` must be like the outputs.")
+    by_mean = None if by_mean is None else by_mean.contiguous()
+    if by_ll is not None:
+        by_ll = by_ll.double().contiguous()
+    priors, log_det = _inverses(sizes, model)
+    if log_det is not None and by_ll is not None:
+        by_ll = torch.where(observed.any(-1), by_ll, 0.0)
+    by_inputs = [
+        torch.empty_like(v) for v in (x, action, start if stored is None else stored, start)
+    ]
+    by_model = [torch.empty_like(v) for v in model]
+    Q, P0, R, H, B, _, _, *layers = model
+    if log_det is not None:
+        Q, P0 = priors
+        by_model[:2] = [torch.empty_like(prior) for prior in priors]
+    sizes.call(
+        "backward",
         [
-            None if g_mean is None else g_mean.contiguous(),
-            None if g_ll is None else g_ll.contiguous(),
-            reset, restart, Q, initial_cov, H, B, tape, tape.new_empty(of.scratch), *by_inputs,
-            *by_model[:7], observed, R, *layers[0::2], *by_model[7:],
+            by_mean, by_ll, reset, use_stored, Q, P0, H, B, tape, *by_inputs[:2],
+            None if stored is None else by_inputs[2], by_inputs[3], *by_model[:7], observed, R,
+            *layers[0::2], *by_model[7:],
         ],
+        9,
     )  # fmt: skip
-    return by_inputs, by_model
+    if log_det is not None:
+        for k, (prior, chosen) in enumerate(zip(priors, (~reset, reset), strict=True)):
+            by = -prior @ by_model[k] @ prior
+            if by_ll is not None:
+                by -= 0.5 * torch.where(chosen, by_ll, 0.0).sum() * prior
+            by_model[k] = by.to(x.dtype)
+    return [*by_inputs, *by_model]
+
+
+def _forward_fake(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
+    x, sizes = args[0], _Sizes(args[:7], args[7], args[8:])
+    mean = x.new_empty(sizes.batch, sizes.time, sizes.state)
+    return mean, x.new_empty(mean.shape[:2]), x.new_empty(sizes.tape, dtype=torch.float64)
+
+
+def _backward_fake(*args: Any) -> list[Tensor]:
+    x, _, action, _, _, stored, start = args[3:10]
+    inputs = (x, action, start if stored is None else stored, start)
+    return [torch.empty_like(v) for v in (*inputs, *args[10])]
+
+
+def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    ctx.flags = inputs[8:]
+    ctx.save_for_backward(output[2], *inputs[:7], *inputs[7])
+    ctx.mark_non_differentiable(output[2])
+    ctx.set_materialize_grads(False)
+
+
+def register_gradient(pytorch_form: Callable[..., tuple[Tensor, Tensor]]) -> None:
+    """Register the operator's derivative; one that is differentiated again runs in PyTorch.
+
+    Args:
+        pytorch_form: of a :class:`StateSpace` and the seven tensors of a sequence, returns the
+            filtered means and the log-likelihoods.
+
+    Example:
+        >>> from torchrl_drbpn.functional import filtering  # registers its own
+        >>> hasattr(torch.ops.torchrl_drbpn, "filter_rows")
+        True
+    """
+
+    def gradient(ctx: Any, *by_outputs: Tensor | None) -> tuple[Any, ...]:
+        tape, *saved = ctx.saved_tensors
+        by_mean, by_ll, _ = by_outputs
+        sequence, model, (residual, tanh) = saved[:7], saved[7:], ctx.flags
+        if not torch.is_grad_enabled():
+            found = torch.ops.torchrl_drbpn.filter_rows_backward(
+                by_mean, by_ll, tape, *sequence, model, residual, tanh
+            )
+            x, action, stored, start, *of_model = found
+            stored = None if sequence[5] is None else stored
+            return x, None, action, None, None, stored, start, of_model, None, None
+        Q, P0, R, H, B, d, m0, *layers = model
+        f = TransitionMLP(
+            tuple(layers[::2]), tuple(layers[1::2]), residual, "tanh" if tanh else "relu"
+        )
+        outputs = pytorch_form(StateSpace(f, Q, H, R, B, d, m0, P0), *sequence)
+        wanted = [x for x in saved if x is not None and x.requires_grad]
+        pairs = [(o, g) for o, g in zip(outputs, by_outputs[:2], strict=True) if g is not None]
+        found = torch.autograd.grad(
+            [o for o, _ in pairs],
+            wanted,
+            [g for _, g in pairs],
+            create_graph=True,
+            allow_unused=True,
+        )
+        known = {id(x): g for x, g in zip(wanted, found, strict=True)}
+        every = [known.get(id(x)) for x in saved]
+        return *every[:7], every[7:], None, None
+
+    torch.library.register_autograd(
+        "torchrl_drbpn::filter_rows", gradient, setup_context=_setup_context, lib=_LIBRARY
+    )
+
+
+def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], Any]:
+    """Run the operator for one member of the batch after the other."""
+
+    def member(value: Any, dim: Any, i: int) -> Any:
+        if isinstance(value, (list, tuple)):
+            return [member(v, d, i) for v, d in zip(value, dim, strict=True)]
+        return value if dim is None else value.select(dim, i)
+
+    runs = [
+        torch.ops.torchrl_drbpn.filter_rows(
+            *(member(value, dim, i) for value, dim in zip(args, in_dims, strict=True))
+        )
+        for i in range(info.batch_size)
+    ]
+    return tuple(torch.stack(parts) for parts in zip(*runs, strict=True)), (0, 0, 0)
+
+
+_LIBRARY.impl("filter_rows", _forward, "CPU")
+_LIBRARY.impl("filter_rows_backward", _backward, "CPU")
+torch.library.register_fake("torchrl_drbpn::filter_rows", _forward_fake, lib=_LIBRARY)
+torch.library.register_fake("torchrl_drbpn::filter_rows_backward", _backward_fake, lib=_LIBRARY)
+torch.library.register_vmap("torchrl_drbpn::filter_rows", _vmap, lib=_LIBRARY)

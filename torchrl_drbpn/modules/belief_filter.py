@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -12,24 +10,20 @@ from torch import Tensor, nn
 from torchrl_drbpn.functional import (
     Belief,
     FilterOutput,
-    FollowedOutput,
-    Following,
-    MeanNetwork,
     StateSpace,
-    filter_followed,
     filter_sequence,
     filter_step,
     predict_step,
     saturate_innovation,
 )
-from torchrl_drbpn.functional.model import Form, checked_form
-from torchrl_drbpn.functional.precision import outside_autocast
+from torchrl_drbpn.functional.gaussian import without_autocast
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
     LinearGaussianEmission,
     check_dim,
     initial_covariance,
+    transition_functions,
 )
 
 __all__ = ["BeliefDivergedError", "BeliefFilter"]
@@ -69,7 +63,7 @@ class BeliefFilter(nn.Module):
         emission: default :class:`LinearGaussianEmission`.
         initial_std: standard deviation that initial_cov starts from, state units.
         initial_cov: "diag" or "full".
-        form: how sequences are computed, see :func:`torchrl_drbpn.functional.filter_sequence`.
+        covariance: "constant": the predicted covariance is Q whatever came before (eq. 8).
         validate: look at values too, not only at shapes: a NaN or inf that the mask calls
             observed raises ValueError. Needs a value on the host, so it is skipped while
             compiling or exporting; switch it off under ``vmap``.
@@ -77,8 +71,8 @@ class BeliefFilter(nn.Module):
         dtype: of the parameters.
 
     Raises:
-        ValueError: for a dimension under 1, parts whose dimensions disagree, or a ``form`` that
-            does not fit them.
+        ValueError: for a dimension under 1, parts whose dimensions disagree, an emission that is
+            not affine, a covariance that is not positive definite, or another ``covariance``.
 
     Example:
         >>> import torch
@@ -102,12 +96,14 @@ class BeliefFilter(nn.Module):
         emission: LinearGaussianEmission | None = None,
         initial_std: float = 1.0,
         initial_cov: CovKind = "diag",
-        form: Form = "auto",
+        covariance: Literal["constant"] = "constant",
         validate: bool = True,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
+        if covariance != "constant":
+            raise ValueError(f"`covariance` must be 'constant', got {covariance!r}.")
         obs_dim, action_dim = check_dim("obs_dim", obs_dim), check_dim("action_dim", action_dim)
         if state_dim is None:
             given = getattr(transition, "state_dim", None) or getattr(emission, "state_dim", None)
@@ -138,13 +134,12 @@ class BeliefFilter(nn.Module):
                         "the same dimensions."
                     )
         self.obs_dim, self.action_dim, self.state_dim = obs_dim, action_dim, state_dim
-        self.form, self.validate = form, validate
+        self.covariance, self.validate = covariance, validate
         self.transition = transition
         self.emission = emission
         self.initial_mean = nn.Parameter(torch.zeros(state_dim, device=device, dtype=dtype))
         self.initial_noise = initial_covariance(state_dim, initial_cov, initial_std, device, dtype)
-        self._shared: StateSpace | None = None
-        checked_form(self.state_space(), form)
+        self._check_model()
 
     def reset_parameters(self) -> None:
         """Start again, the parts included where they know how."""
@@ -162,50 +157,42 @@ class BeliefFilter(nn.Module):
 
     def state_space(self) -> StateSpace:
         """Return the model's tensors, built from the parameters (differentiable)."""
-        return self._state_space() if self._shared is None else self._shared
-
-    @contextmanager
-    def shared_state_space(self) -> Iterator[StateSpace]:
-        """Build the model's tensors once for all calls inside the block.
-
-        For a loss that calls the filter several times: the parameters must not change inside.
-
-        Yields:
-            What :meth:`state_space` returns until the block ends.
-
-        Example:
-            >>> filter = BeliefFilter(obs_dim=5, action_dim=2)
-            >>> with filter.shared_state_space() as model:
-            ...     filter.state_space() is model
-            True
-        """
-        before, self._shared = self._shared, self.state_space()
-        try:
-            yield self._shared
-        finally:
-            self._shared = before
-
-    @outside_autocast
-    def _state_space(self) -> StateSpace:
-        transition = self.transition
-        mean: MeanNetwork | Callable[[Tensor, Tensor], Tensor]
-        cov: Tensor | Callable[[Tensor, Tensor], Tensor]
-        if isinstance(transition, GaussianTransition):
-            mean = transition.mean_network()
-            cov = transition.cov() if transition.constant_cov else transition.cov
-        else:
-            mean, cov = lambda m, a: transition(m, a)[0], lambda m, a: transition(m, a)[1]
-        emission = self.emission
+        with without_autocast(self.initial_mean):
+            mean, cov = transition_functions(self.transition)
+            matrix, action_matrix, offset = self.emission.affine()
+            R, initial_cov = self.emission.compact_cov(), self.initial_noise.compact()
         return StateSpace(
-            mean,
-            cov,
-            emission.matrix,
-            emission.compact_cov(),
-            emission.action_matrix,
-            emission.offset,
-            self.initial_mean,
-            self.initial_cov,
+            mean, cov, matrix, R, action_matrix, offset, self.initial_mean, initial_cov
         )
+
+    @torch.no_grad()
+    def _check_model(self) -> None:
+        """Raise on a first model that cannot be: an emission not affine, a covariance not SPD."""
+        model, like = self.state_space(), self.initial_mean
+        if like.is_meta:
+            return
+        state = like.new_full((1, self.state_dim), 2.0)
+        action = like.new_full((1, self.action_dim), -3.0)
+        expected = state @ model.emission_matrix.mT + model.offset(action)
+        if not torch.allclose(self.emission(state, action), expected, rtol=1e-3, atol=1e-4):
+            raise ValueError(
+                "`emission` must be affine, H s + B a + d: its forward at (2, -3) is not what its "
+                "values at 0 and at unit vectors say."
+            )
+        Q = model.transition_cov
+        covs = {
+            "transition, Q": Q if isinstance(Q, Tensor) else Q(0 * state, 0 * action),
+            "emission, R": model.emission_cov,
+            "initial_cov": model.initial_cov,
+        }
+        for name, cov in covs.items():
+            full = cov.diag() if cov.ndim == 1 else cov
+            _, info = torch.linalg.cholesky_ex(full.double())
+            if bool((info != 0).any()) or not torch.equal(full, full.mT):
+                raise ValueError(
+                    f"the covariance of `{name}` is not symmetric positive definite: raise its "
+                    "standard deviations, or mend its module."
+                )
 
     # ------------------------------------------------------------------ one step
     def step(
@@ -218,7 +205,6 @@ class BeliefFilter(nn.Module):
         reset: Tensor,
         *,
         return_cov: bool = False,
-        model: StateSpace | None = None,
         gate: float | None = None,
     ) -> FilterOutput:
         """Filter one step.
@@ -234,8 +220,6 @@ class BeliefFilter(nn.Module):
 
         Keyword Args:
             return_cov: whether the filtered covariance is wanted.
-            model: what :meth:`state_space` returned, for many steps with the same parameters; it
-                is built anew by default.
             gate: readings further than about this many standard deviations from their forecast
                 are filtered as if they lay at that distance, and the likelihood is that of these,
                 see :func:`torchrl_drbpn.functional.saturate_innovation`; None: believe them all.
@@ -249,7 +233,7 @@ class BeliefFilter(nn.Module):
         """
         del cov
         self._check_shapes(mean, previous_action, observation, observed, reset)
-        model = self.state_space() if model is None else model
+        model = self.state_space()
         believed = observation
         if gate is not None:
             believed = saturate_innovation(
@@ -263,7 +247,6 @@ class BeliefFilter(nn.Module):
             observed,
             reset,
             return_cov=return_cov,
-            form=self.form,
         )
         # What arrived, not what a belief gone astray has made of it: the error names the cause.
         self._check_values(out, mean, previous_action, observation, observed)
@@ -279,11 +262,10 @@ class BeliefFilter(nn.Module):
         observed: Tensor,
         reset: Tensor,
         *,
-        restart: Tensor | None = None,
-        restart_mean: Tensor | None = None,
-        following: Following | None = None,
+        use_stored_state: Tensor | None = None,
+        stored_mean: Tensor | None = None,
         return_cov: bool = False,
-    ) -> FilterOutput | FollowedOutput:
+    ) -> FilterOutput:
         """Filter sequences, episode starts inside them included.
 
         Args:
@@ -295,16 +277,13 @@ class BeliefFilter(nn.Module):
             reset: bool, shape ``(*batch, time)``, True = start from the initial belief.
 
         Keyword Args:
-            restart: bool, shape ``(*batch, time)``; True takes the belief of the step before
-                from ``restart_mean`` instead of from the sequence.
-            restart_mean: shape ``(*batch, time, state)``.
-            following: observations that come after some of the steps and are no steps themselves,
-                whose likelihood is wanted.
+            use_stored_state: bool, shape ``(*batch, time)``; True takes the belief of the step
+                before from ``stored_mean`` instead of from the sequence.
+            stored_mean: shape ``(*batch, time, state)``.
             return_cov: whether the filtered covariances are wanted.
 
         Returns:
-            :class:`~torchrl_drbpn.functional.FilterOutput` with shapes ``(*batch, time, ...)``;
-            with ``following`` a :class:`~torchrl_drbpn.functional.FollowedOutput`.
+            :class:`~torchrl_drbpn.functional.FilterOutput` with shapes ``(*batch, time, ...)``.
 
         Raises:
             ValueError: for a shape, a dtype or an observed value that cannot be.
@@ -316,21 +295,18 @@ class BeliefFilter(nn.Module):
                 "`mean` must be the belief before the first step, of shape (*batch, state) = "
                 f"{(*reset.shape[:-1], self.state_dim)}, got {tuple(mean.shape)}."
             )
-        if following is not None:
-            self._check_following(following, previous_action.dtype)
-        sequence = (mean, previous_action, observation, observed, reset)
-        how: dict[str, Any] = {
-            "restart": restart,
-            "restart_mean": restart_mean,
-            "return_cov": return_cov,
-            "form": self.form,
-        }
-        out: FilterOutput | FollowedOutput
-        if following is None:
-            out = filter_sequence(self.state_space(), *sequence, **how)
-        else:
-            out = filter_followed(self.state_space(), *sequence, following, **how)
-        self._check_values(out, mean, previous_action, observation, observed, following)
+        out = filter_sequence(
+            self.state_space(),
+            mean,
+            previous_action,
+            observation,
+            observed,
+            reset,
+            use_stored_state=use_stored_state,
+            stored_mean=stored_mean,
+            return_cov=return_cov,
+        )
+        self._check_values(out, mean, previous_action, observation, observed)
         return out
 
     def predict(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
@@ -344,7 +320,8 @@ class BeliefFilter(nn.Module):
         Returns:
             The belief before the observation of this step.
         """
-        return predict_step(self.state_space(), mean, previous_action, reset)
+        with without_autocast(mean):
+            return predict_step(self.state_space(), mean, previous_action, reset)
 
     # ------------------------------------------------------------------ checks
     def _check_shapes(
@@ -383,50 +360,24 @@ class BeliefFilter(nn.Module):
                     "TorchRL's DoubleToFloat to the environment, or build the filter with dtype=."
                 )
 
-    def _check_following(self, following: Following, dtype: torch.dtype) -> None:
-        """Raise on shapes or dtypes of what follows that cannot be."""
-        step, action, x, observed = following
-        count = len(step) if step.ndim == 1 else -1
-        wanted = (
-            ("step", step, (count,), torch.int64),
-            ("previous_action", action, (count, self.action_dim), dtype),
-            ("observation", x, (count, self.obs_dim), dtype),
-            ("observed", observed, (count, self.obs_dim), torch.bool),
-        )
-        for name, value, shape, kind in wanted:
-            if value.shape != shape or value.dtype != kind:
-                raise ValueError(
-                    f"`following.{name}` must be {str(kind).removeprefix('torch.')} of shape "
-                    f"{shape if count >= 0 else '(count,)'}, got {_describe(value)}: one row for "
-                    "every place in (*batch, time) flattened after which an observation follows."
-                )
-
     def _check_values(
         self,
-        out: FilterOutput | FollowedOutput,
+        out: FilterOutput,
         mean: Tensor,
         previous_action: Tensor,
         observation: Tensor,
         observed: Tensor,
-        following: Following | None = None,
     ) -> None:
         """Raise on a value that cannot be; a few sums and one number on the host tell.
 
         The mean is looked at too: where nothing was observed the likelihood is 0 whatever it is.
         """
-        if not self.validate or torch.compiler.is_compiling():
+        if not self.validate or torch.compiler.is_compiling() or out.mean.is_meta:
             return
         total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
-        if isinstance(out, FollowedOutput):
-            total = total + out.following_log_likelihood.detach().sum()
         if bool(torch.isfinite(total)):
             return
         bad = observed & ~torch.isfinite(observation)
-        actions = [previous_action]
-        if following is not None:
-            beside = following.observed & ~torch.isfinite(following.observation)
-            bad = torch.cat([bad.flatten(0, -2), beside])
-            actions.append(following.previous_action)
         if bool(bad.any()):
             components = bad.flatten(0, -2).any(0).nonzero().flatten().tolist()
             raise ValueError(
@@ -434,7 +385,7 @@ class BeliefFilter(nn.Module):
                 f"(components {components}): mark them missing, for example with "
                 "ObservedFromNaN."
             )
-        for name, value in (*(("previous_action", action) for action in actions), ("mean", mean)):
+        for name, value in (("previous_action", previous_action), ("mean", mean)):
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(
                     f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "

@@ -11,8 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_drbpn.functional import innovation, tril_to_vector
-from torchrl_drbpn.functional.precision import outside_autocast
-from torchrl_drbpn.functional.saturation import check_gate
+from torchrl_drbpn.functional.gaussian import without_autocast
+from torchrl_drbpn.functional.robust import check_gate
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 
@@ -118,9 +118,12 @@ class BeliefFilterModule(RecurrentBeliefModule):
         self.policy_input, self.gate = policy_input, gate
 
     @dispatch
-    @outside_autocast
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the belief; see the class for keys and modes."""
+        with without_autocast(self.filter.initial_mean):
+            return self._write_belief(tensordict)
+
+    def _write_belief(self, tensordict: TensorDictBase) -> TensorDictBase:
         given = self._read(tensordict)
         (mean,) = given.state
         readings = (given.previous_action, given.observation, given.observed, given.reset)
@@ -138,7 +141,7 @@ class BeliefFilterModule(RecurrentBeliefModule):
             start = mean[..., :1, :].sum(-2)
             out = self.filter(
                 start, None, *readings,
-                restart=given.use_stored_state, restart_mean=mean, return_cov=want_cov,
+                use_stored_state=given.use_stored_state, stored_mean=mean, return_cov=want_cov,
             )  # fmt: skip
             before = torch.cat([mean[..., :1, :], out.mean[..., :-1, :]], -2)
             mean = torch.where(given.use_stored_state.unsqueeze(-1), mean, before)

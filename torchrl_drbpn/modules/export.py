@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import fields
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_drbpn.functional import (
-    MeanNetwork,
     StateSpace,
-    choose_form,
+    TransitionMLP,
     filter_step,
     filtered_cov,
     saturate_innovation,
     tril_to_vector,
     zero_missing,
 )
-from torchrl_drbpn.functional.saturation import bounded, reading_variance
+from torchrl_drbpn.functional.robust import bounded, reading_variance
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 
 __all__ = ["PolicyStep"]
+
+_MATRICES = [field.name for field in fields(StateSpace)][1:]
 
 
 class PolicyStep(nn.Module):
@@ -94,7 +96,11 @@ class PolicyStep(nn.Module):
         filter = copy.deepcopy(belief.filter).requires_grad_(False)
         with torch.no_grad():
             model = filter.state_space()
-        self.form = choose_form(model)
+        self.form = "information" if model.information_form else "innovation"
+        if not isinstance(model.transition, TransitionMLP) or not isinstance(
+            model.transition_cov, Tensor
+        ):
+            self.form = "loop"
         self.filter = filter if self.form == "loop" else None
         self.state_dim = filter.state_dim
         for name, limit in (("action_low", action_low), ("action_high", action_high)):
@@ -107,35 +113,35 @@ class PolicyStep(nn.Module):
     def _keep_model(self, model: StateSpace) -> None:
         """Put the model, and what follows from it, into buffers."""
         transition = model.transition
-        assert isinstance(transition, MeanNetwork)  # the form says so; for the type checker
+        assert isinstance(transition, TransitionMLP)  # the form says so; for the type checker
         self.residual, self.activation = transition.residual, transition.activation
         self.layers = len(transition.weights)
         for i, (weight, bias) in enumerate(zip(transition.weights, transition.biases, strict=True)):
             self._keep(f"weight_{i}", weight)
             self._keep(f"bias_{i}", bias)
-        for name in StateSpace._fields[1:]:
-            self._keep(name, getattr(model, name))
+        matrices = [getattr(model, name) for name in _MATRICES]
+        for name, value in zip(_MATRICES, matrices, strict=True):
+            self._keep(name, value)
         # H m + B a + d as one product with (m, a).
         self._keep("expectation", torch.cat([model.emission_matrix, model.action_matrix], -1))
         # float64, as in the belief module: what is factorised loses most digits in float32 where R
         # is small.
-        model = model.double()
-        H, Q, P0 = model.emission_matrix, model.transition_cov, model.initial_cov
-        assert isinstance(Q, Tensor)
+        given = (model.emission_matrix, model.constant_cov(), model.full_initial_cov())
+        H, Q, P0 = (value.double() for value in given)
         self._keep("wide_matrix", H)
         if self.gate is not None:
             for name, P in (("deviation", Q), ("initial_deviation", P0)):
-                deviation = reading_variance(H, P, model.emission_cov).sqrt()
+                deviation = reading_variance(H, P, model.emission_cov.double()).sqrt()
                 self._keep(name, deviation.to(self.get_buffer("expectation").dtype))
         if self.form == "innovation":
-            R = model.full_emission_cov()
+            R = model.full_emission_cov().double()
             self._keep("cross", H @ Q)
             self._keep("initial_cross", H @ P0)
             self._keep("innovation_cov", H @ Q @ H.mT + R)
             self._keep("initial_innovation_cov", H @ P0 @ H.mT + R)
             self._keep("eye", torch.eye(H.shape[0], dtype=H.dtype, device=H.device))
         else:
-            self._keep("inverse_noise", 1.0 / model.emission_cov)
+            self._keep("inverse_noise", 1.0 / model.emission_cov.double())
             self._keep("outer", (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2))
             self._keep("precision", torch.linalg.inv(Q))
             self._keep("initial_precision", torch.linalg.inv(P0))
@@ -147,8 +153,8 @@ class PolicyStep(nn.Module):
         """Return the kept model."""
         weights = tuple(self.get_buffer(f"weight_{i}") for i in range(self.layers))
         biases = tuple(self.get_buffer(f"bias_{i}") for i in range(self.layers))
-        network = MeanNetwork(weights, biases, self.residual, self.activation)
-        return StateSpace(network, *(self.get_buffer(name) for name in StateSpace._fields[1:]))
+        network = TransitionMLP(weights, biases, self.residual, self.activation)
+        return StateSpace(network, *(self.get_buffer(name) for name in _MATRICES))
 
     # ------------------------------------------------------------------ one decision
     def initial_state(self, batch: int) -> tuple[Tensor, Tensor]:

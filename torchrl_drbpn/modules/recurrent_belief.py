@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -195,14 +194,7 @@ class RecurrentBeliefModule(TensorDictModuleBase):
     @property
     def dtype(self) -> torch.dtype:
         """Precision of the filter's parameters."""
-        # Value estimators swap detached tensors in, which are attributes and no parameters.
-        swapped = (
-            value
-            for module in self.filter.modules()
-            for value in vars(module).values()
-            if isinstance(value, Tensor)
-        )
-        return next(itertools.chain(self.filter.parameters(), swapped)).dtype
+        return next(self.filter.parameters()).dtype
 
     @property
     def recurrent_mode(self) -> bool:

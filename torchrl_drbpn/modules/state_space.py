@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from numbers import Integral
 from typing import Literal
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_drbpn.functional import (
     Belief,
-    MeanNetwork,
+    TransitionMLP,
     full_cov,
     inverse_softplus,
     positive_std,
@@ -21,6 +21,7 @@ from torchrl_drbpn.functional import (
 __all__ = ["GaussianTransition", "LinearGaussianEmission"]
 
 CovKind = Literal["diag", "full"]
+Function = Callable[[Tensor, Tensor], Tensor]
 _MIN_INITIAL_STD = 1e-3
 
 
@@ -83,15 +84,16 @@ class _Covariance(nn.Module):
         with torch.no_grad():
             raw.copy_(start.raw)
 
-    def variance(self) -> Tensor:
-        """Return the variances, shape (dim,); a diagonal covariance only."""
-        return positive_std(self.raw, self.min_std).square()
+    def compact(self) -> Tensor:
+        """Return the variances (dim,) of a diagonal covariance, the matrix (dim, dim) of a full."""
+        if self.kind == "diag":
+            return positive_std(self.raw, self.min_std).square()
+        return full_cov(self.raw, self.min_std)
 
     def forward(self) -> Tensor:
         """Return the covariance, shape (dim, dim)."""
-        if self.kind == "diag":
-            return self.variance().diag()
-        return full_cov(self.raw, self.min_std)
+        cov = self.compact()
+        return cov.diag() if self.kind == "diag" else cov
 
 
 def initial_covariance(
@@ -100,7 +102,7 @@ def initial_covariance(
     init_std: float,
     device: torch.device | str | None,
     dtype: torch.dtype | None,
-) -> nn.Module:
+) -> _Covariance:
     """Make the learned covariance of the initial belief; calling it returns ``(dim, dim)``."""
     _check_choice("initial_cov", kind, ("diag", "full"))
     if not init_std > _MIN_INITIAL_STD:
@@ -119,8 +121,8 @@ class GaussianTransition(nn.Module):
     ``residual``. Q is a free parameter (the paper's runs) or a network of (mean, action)
     (eq. 8), diagonal or full, with a floor on its standard deviations.
 
-    A constant Q opens the fast forms of the filter; a network Q makes the covariances depend on
-    the past, so the filter runs step by step.
+    With a constant Q the gains of a whole minibatch are computed at once; a network Q makes the
+    covariances depend on the past, so the filter runs step by step.
 
     Args:
         state_dim: number of latent components.
@@ -209,10 +211,10 @@ class GaussianTransition(nn.Module):
         if self.cov_layers is not None:
             self._start_from_init_std(_linear(self.cov_layers))
 
-    def mean_network(self) -> MeanNetwork:
-        """Return f as tensors, as the fast filter wants it."""
+    def mean_network(self) -> TransitionMLP:
+        """Return f as tensors, as the native filter reads it."""
         weights, biases = zip(*_linear(self.layers), strict=True)
-        return MeanNetwork(weights, biases, self.residual, self.activation)
+        return TransitionMLP(weights, biases, self.residual, self.activation)
 
     @property
     def constant_cov(self) -> bool:
@@ -237,7 +239,7 @@ class GaussianTransition(nn.Module):
         if mean is None or action is None or self.cov_layers is None:
             raise ValueError("`mean` and `action` are needed: this Q is a network of both.")
         weights, biases = zip(*_linear(self.cov_layers), strict=True)
-        raw = MeanNetwork(weights, biases, False, self.activation)(mean, action)
+        raw = TransitionMLP(weights, biases, False, self.activation)(mean, action)
         if self.cov_kind == "diag":
             return torch.diag_embed(positive_std(raw, self.min_std).square())
         return full_cov(raw.view(*raw.shape[:-1], self.state_dim, self.state_dim), self.min_std)
@@ -255,6 +257,25 @@ class GaussianTransition(nn.Module):
         predicted = self.mean_network()(mean, action)
         cov = self.cov(mean, action)
         return Belief(predicted, cov.expand(*predicted.shape, self.state_dim))
+
+
+def transition_functions(
+    transition: nn.Module,
+) -> tuple[TransitionMLP | Function, Tensor | Function]:
+    """Return f and Q of a transition as :class:`~torchrl_drbpn.functional.StateSpace` takes them.
+
+    Args:
+        transition: returns (mean, cov) of (mean, action). A :class:`GaussianTransition` is taken
+            apart unless a subclass has a ``forward`` of its own, which counts.
+    """
+    if (
+        not isinstance(transition, GaussianTransition)
+        or type(transition).forward is not GaussianTransition.forward
+    ):
+        return (lambda m, a: transition(m, a)[0]), (lambda m, a: transition(m, a)[1])
+    if transition.noise is None:
+        return transition.mean_network(), transition.cov
+    return transition.mean_network(), transition.cov()
 
 
 class LinearGaussianEmission(nn.Module):
@@ -332,13 +353,25 @@ class LinearGaussianEmission(nn.Module):
         nn.init.zeros_(self.offset)
         self.noise.reset_parameters()
 
+    def affine(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return H, B and d; a ``forward`` of a subclass counts, evaluated at the unit vectors."""
+        if type(self).forward is LinearGaussianEmission.forward:
+            return self.matrix, self.action_matrix, self.offset
+        units = torch.eye(
+            1 + self.state_dim + self.action_dim, dtype=self.matrix.dtype, device=self.matrix.device
+        )
+        state, action = units[:, 1 : 1 + self.state_dim], units[:, 1 + self.state_dim :]
+        values = self(state, action)
+        offset, columns = values[0], (values[1:] - values[0]).mT
+        return columns[:, : self.state_dim], columns[:, self.state_dim :], offset
+
     def cov(self) -> Tensor:
         """Return R, shape ``(obs, obs)``."""
         return self.noise()
 
     def compact_cov(self) -> Tensor:
         """Return the variances ``(obs,)`` of a diagonal R, the matrix ``(obs, obs)`` of a full."""
-        return self.noise.variance() if self.noise.kind == "diag" else self.noise()
+        return self.noise.compact()
 
     def forward(self, state: Tensor, previous_action: Tensor) -> Tensor:
         """Return the expected observation.

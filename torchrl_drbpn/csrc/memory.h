@@ -81,7 +81,7 @@ static Ahead lay_ahead(const Sizes *s, Memory *m) {
     return a;
 }
 
-/* Of `spread` in native_information.h: blocks of weights, one block of inverses, sums of half an
+/* Of `spread` in information.h: blocks of weights, one block of inverses, sums of half an
  * inverse a sensor. */
 static long spread_size(const Sizes *s) {
     long sensors = (s->obs + BLOCK - 1) / BLOCK * BLOCK;

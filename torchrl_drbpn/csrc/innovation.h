@@ -3,8 +3,8 @@
  * P is Q at an ordinary step and initial_cov at the first of an episode, so P H' (`cross`) and
  * H P H' + R (`cov`) are there twice; the mask M makes an S of its own of every row. Forward the
  * mean moves by P H' z with z = inv(S) e; back, e receives inv(S) H P g of what the mean receives,
- * g. native.c calls these in the order in which they stand here, and those of
- * native_information.h at the same places.
+ * g. filter.h calls these in the order in which they stand here, and those of
+ * information.h at the same places.
  */
 
 /* Invert M (H P H' + R) M' of LANES rows; the inverse is zero where nothing was observed. */

@@ -1,12 +1,11 @@
 /* The belief filter over [batch, time] and its reverse pass as two functions, for a constant Q, eq.
- * (8), (10), (12) [DRBPN]. The same sums as recurrence.py, where PyTorch needs some hundred small
- * operations a minibatch. compiled.py compiles this file, once for each `given`; the files that it
- * includes hold functions that are used here alone:
+ * (8), (10), (12) [DRBPN]. The same sums as functional/filtering.py, where PyTorch needs some hundred
+ * small operations a minibatch. filter_float.c and filter_double.c compile it, once for each `given`:
  *
- *   native_linalg.h       vectors, matrix products, many small inverses at once
- *   native_memory.h       sizes and where everything lies
- *   native_innovation.h   the gain by inv(S), obs x obs, and back
- *   native_information.h  the gain by C = inv(inv(P) + H' W H), state x state, and back
+ *   linalg.h       vectors, matrix products, many small inverses at once
+ *   memory.h       sizes and where everything lies
+ *   innovation.h   the gain by inv(S), obs x obs, and back
+ *   information.h  the gain by C = inv(inv(P) + H' W H), state x state, and back
  *
  * The two forms differ in how z = inv(S) e and the gain of a row come about, and in what the
  * covariances receive. What is here serves both: the transition, the innovation
@@ -16,25 +15,23 @@
  * What the caller gives and gets is of type `given`, float or double; all arithmetic is in double. S
  * is as ill-conditioned as signal over noise, and where H is of low rank float loses most digits of
  * inv(S). Likelihoods, their gradients and the information form's inv(P) are double for every caller.
+ *
+ * Nothing is checked here: functional/native.py checks every size before it calls.
  */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
 
-#ifndef REAL
-#define REAL float
-#endif
-typedef REAL given;
 typedef double real;
 #define LOG_2PI 1.8378770664093453
 
-#include "native_linalg.h"
-#include "native_memory.h"
-#include "native_innovation.h"
-#include "native_information.h"
+#include "linalg.h"
+#include "memory.h"
+#include "innovation.h"
+#include "information.h"
 
 /* Reals that the caller allocates: tape, scratch of forward, scratch of backward. */
-void sizes(const int64_t *dims, int64_t *out) {
+void NAME(sizes)(const int64_t *dims, int64_t *out) {
     Sizes s = read_sizes(dims);
     Memory tape = {0}, ahead = {0}, back = {0};
     lay_tape(&s, &tape), lay_ahead(&s, &ahead), lay_back(&s, &back);
@@ -45,13 +42,16 @@ void sizes(const int64_t *dims, int64_t *out) {
 
 /* One step of the transition: the predicted mean into a.mean and, beside the action, predicted. */
 static void predict(const Sizes *s, const Ahead *a, const Tape *tape, long t, const given *start,
-                    const given *stored, const uint8_t *restart, const given *action,
+                    const given *stored, const uint8_t *use_stored, const given *action,
                     const uint8_t *reset, const given *initial) {
     long m = s->state, width = s->width[0], S = s->S, J = s->J;
     long batch = s->batch, time = s->time, row = t * batch;
     real *input = tape->input + row * J, *predicted = tape->predicted + row * J;
     for (long b = 0; b < batch; b++) {
-        if (restart && restart[b * time + t]) widen(m, stored + (b * time + t) * m, input + b * J);
+        /* An episode start must not hear of what came before, not even of a NaN. */
+        if (reset[b * time + t]) memset(input + b * J, 0, m * sizeof(real));
+        else if (use_stored && use_stored[b * time + t])
+            widen(m, stored + (b * time + t) * m, input + b * J);
         else if (t == 0) widen(m, start + b * s->start_stride, input + b * J);
         else memcpy(input + b * J, a->mean + b * S, m * sizeof(real));
         widen(s->action, action + (b * time + t) * s->action, input + b * J + m);
@@ -80,11 +80,11 @@ static void predict(const Sizes *s, const Ahead *a, const Tape *tape, long t, co
     }
 }
 
-void forward(const int64_t *dims, void **p) {
+void NAME(forward)(const int64_t *dims, void **p) {
     Sizes z = read_sizes(dims), *s = &z;
     const given *x = p[0], *action = p[2], *stored = p[5], *start = p[6];
     const given *noise = p[9], *H = p[10], *B = p[11], *d = p[12], *initial = p[13];
-    const uint8_t *observed = p[1], *reset = p[3], *restart = p[4];
+    const uint8_t *observed = p[1], *reset = p[3], *use_stored = p[4];
     given *mean = p[14];
     real *ll = p[15];
     Memory kept = {p[16], 0}, scratch = {p[17], 0};
@@ -105,7 +105,7 @@ void forward(const int64_t *dims, void **p) {
     else prepare_innovation(s, &a, &tape, p + 7, noise, observed, reset);
 
     for (long t = 0; t < time; t++) {
-        predict(s, &a, &tape, t, start, stored, restart, action, reset, initial);
+        predict(s, &a, &tape, t, start, stored, use_stored, action, reset, initial);
         for (long b = 0; b < batch; b++) memcpy(a.error + b * N, a.offset, N * sizeof(real));
         product(batch, N, width, tape.predicted + t * batch * J, J, 1, a.sensor_t, N, a.error, N, 1,
                 1);
@@ -140,11 +140,11 @@ static void by_transition(const Sizes *s, const Back *w, const Tape *tape, long 
             for (long i = 0; i < m; i++) w->by_input[b * J + i] += top[b * S + i];
 }
 
-void backward(const int64_t *dims, void **p) {
+void NAME(backward)(const int64_t *dims, void **p) {
     Sizes z = read_sizes(dims), *s = &z;
     const given *g_mean = p[0], *H = p[6], *B = p[7];
     const real *g_ll = p[1];
-    const uint8_t *reset = p[2], *restart = p[3];
+    const uint8_t *reset = p[2], *use_stored = p[3];
     Memory kept = {p[8], 0}, scratch = {p[9], 0};
     given *g_x = p[10], *g_action = p[11], *g_stored = p[12], *g_start = p[13], *g_B = p[18];
     const uint8_t *observed = p[21];
@@ -208,7 +208,7 @@ void backward(const int64_t *dims, void **p) {
         for (long b = 0; b < batch; b++) {
             long at = b * time + t;
             real *by = w.by_input + b * J, *carry = w.carry + b * S;
-            int again = restart && restart[at];
+            int again = use_stored && use_stored[at];
             for (long i = 0; i < m; i++) carry[i] = again ? 0 : by[i];
             if (g_stored)
                 for (long i = 0; i < m; i++) g_stored[at * m + i] = again ? by[i] : 0;

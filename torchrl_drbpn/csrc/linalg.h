@@ -175,26 +175,6 @@ static void invert_lanes(long n, vec *A, vec *X, vec *I, vec *det) {
     }
 }
 
-/* The same for `count` whole matrices in rows, for the forms in PyTorch. */
-void spd_inverse(long n, long count, const given *matrix, given *inverse, given *log_det,
-                 real *scratch) {
-    real *A = scratch, *X = A + n * n * LANES, *I = X + n * n * LANES;
-    for (long first = 0; first < count; first += LANES) {
-        vec det;
-        for (long l = 0; l < LANES; l++) {
-            const given *from = matrix + (first + l < count ? first + l : count - 1) * n * n;
-            for (long i = 0; i < n; i++)
-                for (long j = 0; j <= i; j++) A[(i * n + j) * LANES + l] = from[i * n + j];
-        }
-        invert_lanes(n, (vec *)A, (vec *)X, (vec *)I, &det);
-        for (long l = 0; l < LANES && first + l < count; l++) {
-            given *to = inverse + (first + l) * n * n;
-            for (long i = 0; i < n * n; i++) to[i] = (given)I[i * LANES + l];
-            log_det[first + l] = (given)det[l];
-        }
-    }
-}
-
 /* out[r] = inverse_r in[r] for rows first .. last; `in` starts at row `first`, `out` at row 0. Of
  * the inverses, LANES to a group, there is all, or the lower triangle, one row after the other. */
 static void solve(int triangle, long n, long ld, long first, long last, const real *inverse,

@@ -1,4 +1,4 @@
-"""Readings too far from their forecast: their innovation is saturated."""
+"""A robust update: readings too far from their forecast are moved to a bound around it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import zero_missing
-from torchrl_drbpn.functional.model import StateSpace, predict_step
-from torchrl_drbpn.functional.precision import outside_autocast
+from torchrl_drbpn.functional.gaussian import without_autocast, zero_missing
+from torchrl_drbpn.functional.state_space import StateSpace, predict_step
 
 __all__ = ["bounded", "check_gate", "reading_variance", "saturate_innovation"]
 
 _NORMAL_MEDIAN = 0.6744897501960817  # of |z|, z standard normal: it turns a median into a deviation
 
 
-@outside_autocast
 def saturate_innovation(
     model: StateSpace,
     mean: Tensor,
@@ -34,16 +32,18 @@ def saturate_innovation(
         c = \max(1, \mathrm{med}_{j\ \mathrm{arrived}} |z_j| / .6745)
 
     with :math:`z_i = (x_i - \hat x_i) / \sqrt{S_{ii}}`, :math:`\hat x = H m^- + B a + d` and
-    S = H P H' + R; P is Q, or P_0 where an episode starts. Filtered in the place of x,
-    :math:`\tilde x` bounds what a wrong reading can do to the belief [Masreliez and Martin 1977]; a
-    reading within the bound stays as it is, to the bit.
+    S = H P H' + R; P is Q, or P_0 where an episode starts. A reading within the bound stays as it
+    is, to the bit [Masreliez and Martin 1977].
 
-    c is a robust estimate, from this step's readings, of how many times too small S is. Where most
-    readings are far off, it is the belief that has gone astray, not the sensors: c then lets them
-    pull it back, which a fixed bound, or rejection, may never do, as P does not grow meanwhile.
-    Hence most of the readings that arrive must be right, and of one alone, which is its own median,
-    nothing can be told: it is believed unless ``gate`` is under .67. The median of an even number
-    is the lower one.
+    What is bounded is the marginal deviation of each reading, by the diagonal of S. A reading that
+    contradicts others which it should agree with passes: among five sensors with S = 1 1' + .01 I
+    one may lie 25 of its noise deviations off and only 2.5 marginal ones.
+
+    c estimates from the readings of this step how many times too small S is. If most of them are
+    far off, the belief has diverged, and c lets them pull it back; a fixed bound, or rejection, may
+    never do so, as P does not grow meanwhile. So most of the readings that arrive must be right. A
+    single reading is its own median: it is believed unless ``gate`` is under .67. The median of an
+    even number is the lower one.
 
     Args:
         model: the state-space model.
@@ -76,11 +76,12 @@ def saturate_innovation(
     See also :meth:`torchrl_drbpn.BeliefFilter.step`, which takes a gate.
     """
     check_gate(gate)
-    predicted = predict_step(model, mean, previous_action, reset)
-    H = model.emission_matrix
-    expected = predicted.mean @ H.mT + model.offset(previous_action)
-    deviation = reading_variance(H, predicted.cov, model.emission_cov).sqrt()
-    return bounded(observation, observed, expected, deviation, gate)
+    with without_autocast(mean):
+        predicted = predict_step(model, mean, previous_action, reset)
+        H = model.emission_matrix
+        expected = predicted.mean @ H.mT + model.offset(previous_action)
+        deviation = reading_variance(H, predicted.cov, model.emission_cov).sqrt()
+        return bounded(observation, observed, expected, deviation, gate)
 
 
 def bounded(

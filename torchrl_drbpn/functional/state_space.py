@@ -1,0 +1,244 @@
+"""The state-space model as plain tensors, checked once, and its prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional.gaussian import Belief, as_matrix
+
+__all__ = ["StateSpace", "TransitionMLP", "predict_step"]
+
+
+class TransitionMLP(NamedTuple):
+    r"""Describe the transition mean f(mean, action) as plain tensors.
+
+    .. math:: f(m, a) = [m +] \; W_k \, \sigma(\dots \sigma(W_1 (m, a) + b_1)) + b_k
+
+    Eq. (8) [DRBPN]. Its weights are what the native form of the filter reads.
+
+    Args:
+        weights: of each layer, shape ``(out, in)``; the first layer's ``in`` is state + action,
+            in this order.
+        biases: of each layer, shape ``(out,)``.
+        residual: whether the mean is added to the output.
+        activation: "relu" or "tanh", between the layers.
+
+    Example:
+        >>> import torch
+        >>> weights, biases = (torch.zeros(3, 5),), (torch.zeros(3),)
+        >>> f = TransitionMLP(weights, biases, residual=True, activation="relu")
+        >>> f(torch.ones(4, 3), torch.zeros(4, 2)).tolist() == torch.ones(4, 3).tolist()
+        True
+    """
+
+    weights: tuple[Tensor, ...]
+    biases: tuple[Tensor, ...]
+    residual: bool
+    activation: str
+
+    def __call__(self, mean: Tensor, action: Tensor) -> Tensor:
+        """Evaluate f.
+
+        Args:
+            mean: shape ``(*batch, state)``.
+            action: shape ``(*batch, action)``.
+
+        Returns:
+            Shape ``(*batch, state)``.
+        """
+        hidden = torch.cat([mean, action], -1)
+        last = len(self.weights) - 1
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            hidden = torch.nn.functional.linear(hidden, weight, bias)
+            if i < last:
+                hidden = hidden.relu() if self.activation == "relu" else hidden.tanh()
+        return mean + hidden if self.residual else hidden
+
+
+@dataclass(eq=False)
+class StateSpace:
+    r"""Hold the tensors of a linear-Gaussian-emission state-space model (eq. 2, 3, 8 [DRBPN]).
+
+    .. math::
+        s_t = f(s_{t-1}, a_{t-1}) + N(0, Q), \qquad
+        x_t = H s_t + B a_{t-1} + d + N(0, R), \qquad
+        s_1 \sim N(m_0, P_0)
+
+    A covariance is a matrix ``(n, n)`` or its diagonal, the variances ``(n,)``. All tensors have
+    one floating dtype and one device.
+
+    Args:
+        transition: f; any callable of (mean, action). The native form takes
+            :class:`TransitionMLP` alone.
+        transition_cov: Q, ``(state, state)`` or ``(state,)``; or a callable of (mean, action) that
+            returns ``(*batch, state, state)``.
+        emission_matrix: H, shape ``(obs, state)``.
+        emission_cov: R, ``(obs, obs)`` or ``(obs,)``.
+        action_matrix: B, shape ``(obs, action)``.
+        emission_offset: d, shape ``(obs,)``.
+        initial_mean: m_0, shape ``(state,)``.
+        initial_cov: P_0, ``(state, state)`` or ``(state,)``.
+
+    Raises:
+        ValueError: for a field of another shape, dtype or device.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(
+        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     torch.zeros(2), eye)
+        >>> model.obs_dim, model.state_dim, model.action_dim
+        (2, 2, 1)
+    """
+
+    transition: TransitionMLP | Callable[[Tensor, Tensor], Tensor]
+    transition_cov: Tensor | Callable[[Tensor, Tensor], Tensor]
+    emission_matrix: Tensor
+    emission_cov: Tensor
+    action_matrix: Tensor
+    emission_offset: Tensor
+    initial_mean: Tensor
+    initial_cov: Tensor
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        H, B = self.emission_matrix, self.action_matrix
+        if H.ndim != 2 or B.ndim != 2:
+            raise ValueError(
+                "`emission_matrix` must have shape (obs, state) and `action_matrix` (obs, action), "
+                f"got {tuple(H.shape)} and {tuple(B.shape)}."
+            )
+        (obs, state), action = H.shape, B.shape[1]
+        wanted = [
+            ("action_matrix", B, (obs, action), None),
+            ("emission_offset", self.emission_offset, (obs,), None),
+            ("initial_mean", self.initial_mean, (state,), None),
+            ("emission_cov", self.emission_cov, (obs, obs), (obs,)),
+            ("initial_cov", self.initial_cov, (state, state), (state,)),
+        ]
+        if isinstance(self.transition_cov, Tensor):
+            wanted.append(("transition_cov", self.transition_cov, (state, state), (state,)))
+        if isinstance(self.transition, TransitionMLP):
+            weights, biases = self.transition.weights, self.transition.biases
+            widths = [state + action, *(len(bias) for bias in biases[:-1]), state]
+            if len(weights) != len(biases):
+                raise ValueError(
+                    f"`transition` must have as many biases as weights, got {len(biases)} and "
+                    f"{len(weights)}."
+                )
+            for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
+                wanted.append((f"transition.weights[{i}]", weights[i], (fan_out, fan_in), None))
+                wanted.append((f"transition.biases[{i}]", biases[i], (fan_out,), None))
+        dtype, device = H.dtype, H.device
+        if not dtype.is_floating_point:
+            raise ValueError(f"`emission_matrix` must be floating point, got {dtype}.")
+        for name, value, shape, other in wanted:
+            if value.shape != shape and (other is None or value.shape != other):
+                either = "" if other is None else f" or {other}, its diagonal"
+                raise ValueError(
+                    f"`{name}` must have shape {shape}{either}, got {tuple(value.shape)}: "
+                    f"`emission_matrix` says (obs, state) = {(obs, state)}."
+                )
+            if value.dtype != dtype or value.device != device:
+                raise ValueError(
+                    f"`{name}` is {value.dtype} on {value.device}, `emission_matrix` {dtype} on "
+                    f"{device}: all fields must agree."
+                )
+
+    @property
+    def obs_dim(self) -> int:
+        """Number of sensor components."""
+        return self.emission_matrix.shape[0]
+
+    @property
+    def state_dim(self) -> int:
+        """Number of latent components."""
+        return self.emission_matrix.shape[1]
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action components."""
+        return self.action_matrix.shape[1]
+
+    @property
+    def information_form(self) -> bool:
+        """Whether a gain costs least in the information form: R diagonal and obs > state."""
+        return self.emission_cov.ndim == 1 and self.obs_dim > self.state_dim
+
+    def constant_cov(self) -> Tensor:
+        """Return Q where it is one matrix for every step.
+
+        Returns:
+            Shape ``(state, state)``.
+
+        Raises:
+            ValueError: if transition_cov depends on the state.
+        """
+        if not isinstance(self.transition_cov, Tensor):
+            raise ValueError(
+                "`transition_cov` depends on the state here, so the covariance depends on the "
+                "whole past: ask filter_sequence or filter_step for it with return_cov=True."
+            )
+        return as_matrix("transition_cov", self.transition_cov, self.state_dim)
+
+    def full_emission_cov(self) -> Tensor:
+        """Return R as a matrix, shape ``(obs, obs)``."""
+        return as_matrix("emission_cov", self.emission_cov, self.obs_dim)
+
+    def full_initial_cov(self) -> Tensor:
+        """Return P_0 as a matrix, shape ``(state, state)``."""
+        return as_matrix("initial_cov", self.initial_cov, self.state_dim)
+
+    def offset(self, previous_action: Tensor) -> Tensor:
+        """Return B a + d, shape ``(*batch, obs)``."""
+        return torch.nn.functional.linear(previous_action, self.action_matrix, self.emission_offset)
+
+    def predicted_mean(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Tensor:
+        """Return f(mean, action), or m_0 where an episode starts; reset: ``(*batch, 1)``."""
+        # An episode start must not hear of what came before, not even of a NaN: the transition's
+        # weights would receive 0 * NaN.
+        mean = torch.where(reset, torch.zeros((), dtype=mean.dtype, device=mean.device), mean)
+        return torch.where(reset, self.initial_mean, self.transition(mean, previous_action))
+
+
+def predict_step(model: StateSpace, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
+    r"""Predict one step, or start an episode from the initial belief.
+
+    .. math:: m^- = f(m, a), \; P^- = Q; \qquad \text{at a reset } m^- = m_0, \; P^- = P_0
+
+    Eq. (8) [DRBPN].
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before, shape ``(*batch, state)``.
+        previous_action: shape ``(*batch, action)``.
+        reset: bool, shape ``(*batch,)``.
+
+    Returns:
+        The predicted belief.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(
+        ...     lambda m, a: m + 1, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     torch.zeros(2), eye)
+        >>> reset = torch.tensor([True, False])
+        >>> predict_step(model, torch.ones(2, 2), torch.zeros(2, 1), reset).mean.tolist()
+        [[0.0, 0.0], [2.0, 2.0]]
+    """
+    row = reset.unsqueeze(-1)
+    predicted = model.predicted_mean(mean, previous_action, row)
+    if isinstance(model.transition_cov, Tensor):
+        cov = model.constant_cov()
+    else:
+        zero = torch.zeros((), dtype=mean.dtype, device=mean.device)
+        cov = model.transition_cov(torch.where(row, zero, mean), previous_action)
+    return Belief(predicted, torch.where(row.unsqueeze(-1), model.full_initial_cov(), cov))
