@@ -27,7 +27,7 @@ from analysis.tables import derived_tables, point_kind, point_order
 from report import run
 from training.errors import UserError
 from training.methods import method_name, training_labels
-from training.run_folder import write_config
+from training.run_folder import read_config, write_config
 
 ASKED = {"run": None, "out": None, "from": None, "title": None}
 ASKED |= {"evaluation": None, "reference": "drbpn", "rows": 100, "unfinished": False}
@@ -250,6 +250,13 @@ def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path: Path) 
     assert (training.seeds == 2).all()
     assert training[training["return"] == 10.0].settings.tolist() == ["optim.lr=0.1"]
     assert training[training["return"] == 50.0].method.tolist() == ["ppo_ours"]
+
+
+def test_settings_that_follow_the_seed_are_no_difference(seeds: list[Path]) -> None:
+    for seed, folder in enumerate(seeds):
+        more = {"collector_seed": seed, "transforms": {"own": {"seed": seed}}}
+        write_config(folder, read_config(folder) | more)
+    assert row(tables(seeds)["summary"], "training").seeds == 3
 
 
 def test_the_reference_is_compared_where_half_is_missing_and_at_equal_steps(tmp_path: Path) -> None:

@@ -40,7 +40,10 @@ _EVALUATION = [
 ]
 _EPISODE = ["frames", "point", "mode", "return", "length", "missing_ratio"]
 # Settings that change no number that is reported, or are columns of their own.
-_NOT_COMPARED = ("seed", "threads", "resume", "logger", "checkpoint", "evaluation", "method")
+_NOT_COMPARED = (
+    *("threads", "resume", "logger.", "checkpoint.", "evaluation.", "method"),
+    *("transforms.noise.", "transforms.missingness."),  # again what noise and missingness say
+)
 _VERSIONS = ("torch", "torchrl", "gymnasium", "mujoco", "git_commit")
 
 
@@ -277,7 +280,8 @@ def _thinned(curve: pd.DataFrame, rows: int) -> pd.DataFrame:
 def _name_settings(runs: pd.DataFrame, configs: Sequence[Mapping[str, Any]]) -> None:
     """Fill ``settings`` (differing within a method) and ``overrides`` (within the study)."""
     flat = pd.json_normalize(list(configs)).map(lambda v: "null" if v is None else str(v))
-    flat = flat[[name for name in flat if name.split(".")[0] not in _NOT_COMPARED]]
+    flat = flat[[name for name in flat if not name.startswith(_NOT_COMPARED)]]
+    flat = flat.loc[:, flat.ne(runs.seed.astype(str), axis=0).any()]  # what follows the seed
     for _, members in runs.groupby(["task", "method", "trained_on", "noise_sigma"]):
         runs.loc[members.index, "settings"] = _differing(flat.loc[members.index])
     shared = [n for n in flat if n.split(".")[0] not in ("env", "belief", "missingness", "noise")]
