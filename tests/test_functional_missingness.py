@@ -154,16 +154,6 @@ def test_the_realised_ratio_of_mcar_is_eta(eta):
     assert ((missing.mean(0) - eta).abs() < 4 * error * math.sqrt(OBS)).all()
 
 
-@pytest.mark.parametrize("kind", ["mar", "nmar"])
-def test_realised_ratios_follow_the_probabilities(kind):
-    x, action = example((1,))
-    probability = missing_probability(mechanism(kind), x, action, 0.5)
-    draws = sample_mask(probability.expand(20_000, OBS), x.expand(20_000, OBS), seeded(2))
-    realised = 1 - draws.double().mean(0)
-    error = (probability[0] * (1 - probability[0]) / 20_000).sqrt()
-    assert ((realised - probability[0]).abs() <= 4 * error).all()
-
-
 def test_entries_go_missing_independently():
     missing = 1 - sample_mask(0.4, torch.zeros(20_000, 4), seeded(3)).double()
     correlation = torch.corrcoef(missing.T) - torch.eye(4)
@@ -179,17 +169,14 @@ def test_always_observed_entries_never_go_missing(kind):
     assert not observed[:, ~drawn.always_observed].all(0).any()
 
 
-def test_eta_zero_loses_nothing_and_eta_one_everything():
-    x = torch.zeros(500, OBS)
-    assert sample_mask(0.0, x, seeded()).all()
-    assert not sample_mask(1.0, x, seeded()).any()
-
-
-def test_a_mask_depends_on_the_generator_and_not_on_the_dtype():
+def test_masks_and_hits_depend_on_the_generator_and_not_on_the_dtype():
     x = torch.zeros(50, OBS)
-    first = sample_mask(0.5, x, seeded(6))
-    assert torch.equal(first, sample_mask(0.5, x.double(), seeded(6)))
-    assert not torch.equal(first, sample_mask(0.5, x, seeded(7)))
+    for draw in (
+        lambda x, seed: sample_mask(0.5, x, seeded(seed)),
+        lambda x, seed: sample_spikes(0.2, float(x.numel()), x, seeded(seed))[1],
+    ):
+        assert torch.equal(draw(x, 6), draw(x.double(), 6))
+        assert not torch.equal(draw(x, 6), draw(x, 7))
 
 
 def test_a_nan_is_not_hidden_by_the_mask_that_it_would_upset():
@@ -207,12 +194,6 @@ def test_noise_has_mean_zero_and_the_given_standard_deviation():
     assert (noise[:, 0] == 0).all()
     assert (noise.mean(0).abs() <= 4 * std / math.sqrt(40_000)).all()
     assert ((noise.std(0) - std).abs() <= 4 * std / math.sqrt(2 * 40_000)).all()
-
-
-def test_one_number_is_the_same_number_for_every_component():
-    like = torch.zeros(5, 3)
-    one = sample_noise(0.2, like, seeded(9))
-    assert torch.equal(one, sample_noise(torch.full((3,), 0.2), like, seeded(9)))
 
 
 # ------------------------------------------------------------------------------- outages that last
@@ -281,12 +262,6 @@ def test_outages_of_mean_length_1_over_1_minus_eta_have_no_memory():
     assert (strict[1:] == ~strict[:-1]).all()  # the shortest possible: on and off in turn
 
 
-def test_sensors_fail_independently_of_each_other():
-    missing = 1 - chain(0.5, 2.0, 20_000, 4).double()
-    correlation = torch.corrcoef(missing.T) - torch.eye(4)
-    assert correlation.abs().max() < 4 / math.sqrt(20_000)
-
-
 @pytest.mark.parametrize(
     ("eta", "mean_length", "what"),
     [
@@ -319,13 +294,6 @@ def test_spikes_hit_with_their_probability_and_have_their_deviation():
         values = error[hit[:, i], i]
         assert abs(values.mean()) < 4 * std[i] / math.sqrt(len(values))
         assert abs(values.std() - std[i]) < 4 * std[i] / math.sqrt(2 * len(values))
-
-
-def test_the_same_readings_are_hit_whatever_the_dtype_and_the_deviation():
-    like = torch.zeros(50, OBS)
-    _, first = sample_spikes(0.2, 5.0, like, seeded(6))
-    _, second = sample_spikes(0.2, 9.0, like.double(), seeded(6))
-    assert torch.equal(first, second)
 
 
 def test_the_global_generator_is_neither_read_nor_advanced():

@@ -215,13 +215,6 @@ def test_a_spiked_entry_has_arrived():
     assert (after["observation"][arrived] != after[COMPLETE][arrived]).all()
 
 
-def test_readings_are_hit_with_their_probability_at_resets_as_at_steps():
-    spikes = ObservationSpikes(0.05, 20.0, seed=0, complete_key=COMPLETE, spiked_key="hit")
-    rollout = staircase(spikes, batch=3000, horizon=9).rollout(5)
-    share = rollout["hit"].double().mean((0, 2))
-    assert ((share - 0.05).abs() < 4 * math.sqrt(0.05 * 0.95 / (3000 * OBS))).all()
-
-
 def test_infinite_values_are_errors_and_not_gaps():
     after = ObservedFromNaN()(data(math.inf))
     assert after["observed"].all()

@@ -74,13 +74,6 @@ def test_from_sensors_that_all_work_the_ratio_rises_to_eta():
     assert missing[-1] == pytest.approx(eta, abs=0.02)
 
 
-def test_eta_zero_changes_nothing():
-    clean = staircase().rollout(8, break_when_any_done=False)
-    rollout = staircase(SensorOutages(0.0, 5)).rollout(8, break_when_any_done=False)
-    assert rollout["next", "observed"].all()
-    assert torch.equal(rollout["next", "observation"], clean["next", "observation"])
-
-
 # ----------------------------------------------------------------------------------- keys and masks
 def test_specs_say_what_is_written():
     env = staircase(SensorOutages(0.5, 5, groups=GROUPS))

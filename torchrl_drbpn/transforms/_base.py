@@ -281,22 +281,15 @@ class CorruptingTransform(Transform):
                 arrived = observed if arrived is None else arrived & observed
             if arrived is not None:
                 corrupted = zero_missing(corrupted, arrived)
-            sizes = [part.shape[-1] for part in parts]
+            written = [(self.in_keys, _split(corrupted, parts))]
             if self.complete_keys:
-                self._write(tensordict, [self.complete_keys[i] for i in places], parts)
-            self._write(
-                tensordict, [self.in_keys[i] for i in places], torch.split(corrupted, sizes, -1)
-            )
+                written.append((self.complete_keys, parts))
             if self.writes_mask and arrived is not None:
-                self._write(
-                    tensordict, [self.mask_keys[i] for i in places], torch.split(arrived, sizes, -1)
-                )
+                written.append((self.mask_keys, _split(arrived, parts)))
+            for keys, values in written:
+                for i, value in zip(places, values, strict=True):
+                    tensordict.set(keys[i], value)
         return tensordict
-
-    @staticmethod
-    def _write(tensordict: TensorDictBase, keys: list[NestedKey], parts: Sequence[Tensor]) -> None:
-        for key, part in zip(keys, parts, strict=True):
-            tensordict.set(key, part)
 
     def _check_batches(self, parts: Sequence[Tensor | TensorSpec]) -> None:
         if any(part.shape[:-1] != parts[0].shape[:-1] for part in parts):
@@ -322,31 +315,12 @@ class CorruptingTransform(Transform):
 
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Apply the transform to data outside an environment, as on a replay buffer.
-
-        Args:
-            tensordict: data with the observation keys, any batch shape.
-
-        Returns:
-            The same data, changed.
-        """
+        """Apply the transform to data outside an environment, as on a replay buffer."""
         return self._call(tensordict)
 
     # ------------------------------------------------------------------------------------- specs
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Widen the observation, enter its mask and, on request, the complete observation.
-
-        Args:
-            observation_spec: the spec before the transform.
-
-        Returns:
-            The spec after it.
-
-        Raises:
-            KeyError: if an observation key is absent.
-            ValueError: if an observation is no vector, a key is taken by something else, or the
-                transforms before this one are out of order.
-        """
+        """Widen the observation, enter its mask and, on request, the complete observation."""
         self._check_order()
         spec = observation_spec.clone()
         leaves = [observation_leaf(spec, key, self) for key in self.in_keys]
@@ -383,3 +357,9 @@ class CorruptingTransform(Transform):
 
 def _join(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+
+
+def _split(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
+    sizes = [part.shape[-1] for part in parts]
+    pieces: Sequence[Tensor] = [joined] if len(parts) == 1 else torch.split(joined, sizes, -1)
+    return pieces

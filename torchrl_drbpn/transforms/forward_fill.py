@@ -127,17 +127,7 @@ class FillLastObserved(EnvironmentTransform):
 
     # ------------------------------------------------------------------------------------- specs
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Enter the filled observations and the last values, unbounded.
-
-        Args:
-            observation_spec: the spec before the transform.
-
-        Returns:
-            The spec after it.
-
-        Raises:
-            KeyError: there is no mask to fill by.
-        """
+        """Enter the filled observations and the last values, unbounded."""
         for key, mask_key, out_key, state_key in self._keys:
             leaf = observation_leaf(observation_spec, key, self)
             if mask_key not in observation_spec.keys(True, True):
@@ -147,14 +137,7 @@ class FillLastObserved(EnvironmentTransform):
         return observation_spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Enter the last values as a state that a step reads.
-
-        Args:
-            state_spec: the spec before the transform.
-
-        Returns:
-            The spec after it.
-        """
+        """Enter the last values as a state that a step reads."""
         observation_spec = self.parent.full_observation_spec
         for key, _, _, state_key in self._keys:
             state_spec[state_key] = unbounded_like(observation_leaf(observation_spec, key, self))

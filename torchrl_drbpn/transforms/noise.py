@@ -214,18 +214,7 @@ class ObservationSpikes(SeededTransform):
         return x + error, None
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Widen the observation and enter, on request, what was complete and what was hit.
-
-        Args:
-            observation_spec: the spec before the transform.
-
-        Returns:
-            The spec after it.
-
-        Raises:
-            KeyError: if an observation key is absent.
-            ValueError: if an observation is no vector, or a key is taken by something else.
-        """
+        """Widen the observation and enter, on request, what was complete and what was hit."""
         spec = super().transform_observation_spec(observation_spec)
         for key, spiked in zip(self.in_keys, self.spiked_keys, strict=False):
             enter_new(spec, spiked, mask_like(spec[key]), self)

@@ -184,31 +184,13 @@ class SensorOutages(SeededTransform):
         return Binary(shape=shape, device=leaves[0].device, dtype=torch.bool)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Widen the observation and enter its mask, the state and, on request, what was complete.
-
-        Args:
-            observation_spec: the spec before the transform.
-
-        Returns:
-            The spec after it.
-
-        Raises:
-            KeyError: if an observation key is absent.
-            ValueError: if an observation is no vector, or a key is taken by something else.
-        """
+        """Enter the observation, its mask, the state and, on request, what was complete."""
         spec = super().transform_observation_spec(observation_spec)
         enter_new(spec, self.state_key, self._state_spec(spec), self)
         return spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Enter which sensors work as a state that a step reads.
-
-        Args:
-            state_spec: the spec before the transform.
-
-        Returns:
-            The spec after it.
-        """
+        """Enter which sensors work as a state that a step reads."""
         state_spec[self.state_key] = self._state_spec(self.parent.full_observation_spec)
         return state_spec
 

@@ -145,14 +145,7 @@ class PreviousAction(EnvironmentTransform):
         return Unbounded(shape=leaf.shape, device=leaf.device, dtype=leaf.dtype)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Enter the previous action, unbounded.
-
-        Args:
-            observation_spec: the spec before the transform.
-
-        Returns:
-            The spec after it.
-        """
+        """Enter the previous action, unbounded."""
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             observation_spec[out_key] = self._leaf(key)
         return observation_spec

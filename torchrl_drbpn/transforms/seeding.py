@@ -96,14 +96,7 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
         self._saved_state: Tensor | None = None
 
     def generator(self, device: torch.device) -> torch.Generator | None:
-        """Return what to draw from on `device`; None is torch's global generator.
-
-        Args:
-            device: where random numbers are needed.
-
-        Returns:
-            The generator; drawing from it advances the transform's sequence.
-        """
+        """Return what to draw from on `device`; None is torch's global generator."""
         if self.seed is None or device.type == "meta":
             _separate_worker()
             return None
@@ -142,11 +135,7 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
         return {"seed": torch.tensor(seed), "generator": state.clone()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `get_extra_state` returned.
-
-        Args:
-            state: seed and generator state.
-        """
+        """Continue from what `get_extra_state` returned."""
         seed, saved = int(state["seed"]), state["generator"].cpu()
         self.set_seed(None if seed < 0 else seed)
         self._saved_state = saved.clone() if saved.numel() else None
