@@ -42,9 +42,8 @@ def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:
         True where its whole state can be saved.
 
     Examples:
-        >>> env = gymnasium.make("Swimmer-v5")
-        >>> is_mujoco(env), is_mujoco(env.unwrapped)
-        (False, True)
+        >>> is_mujoco(gymnasium.make("Swimmer-v5").unwrapped)
+        True
     """
     if env.unwrapped is not env:
         return False
@@ -120,8 +119,8 @@ def load_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) -> None:
             raise ValueError(f"{len(held)} entries for {len(envs)} environments")
     except (KeyError, ValueError) as error:
         raise ValueError(f"`generators` must be the JSON that was saved: {error}.") from error
-    physics, derived = state["physics"].cpu().numpy(), state["derived"].cpu().numpy()
-    for env, numbers, values, own in zip(envs, physics, derived, held, strict=True):
+    arrays = (state[name].cpu().numpy() for name in sizes)
+    for env, numbers, values, own in zip(envs, *arrays, held, strict=True):
         # Forward makes contacts and whatever is not in the two lists; it comes first because it
         # also overwrites what they hold.
         mujoco.mj_setState(env.model, env.data, numbers, what)
