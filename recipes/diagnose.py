@@ -8,40 +8,38 @@ steps since a sensor was last seen.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import hydra
+import pandas as pd
 import torch
 from analysis.calibration import Tally, class_names, diagnose, pool
-from analysis.calibration_figures import (
-    Series,
-    draw_outages,
-    outage_figure,
-    precision_figure,
-    read_outages,
-    reliability_figure,
-)
+from analysis.calibration_figures import outage_figure, precision_figure, reliability_figure
 from analysis.calibration_tables import calibration_rows, precision_rows, reliability_rows
-from analysis.runs import find_folders, write_table
-from evaluation.conditions import Point, check_reduction_seed, removed_sensors
-from evaluation.grid import parse_points
-from evaluation.trained import TrainedAgent, load_trained_agent, with_checkpoint
+from evaluation.conditions import parse_conditions, removed_sensors
+from evaluation.folders import find_folders, with_checkpoint
+from evaluation.trained import load_trained_agent
 from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.config import check_mode, missingness_name
 from training.console import say, start
 from training.errors import UserError
-from training.methods import training_labels
+from training.run_folder import write_whole
 
 from torchrl_drbpn import BeliefDivergedError
 
-_FIGURES = ("precision.png", "outages.png", "reliability.png")
+_FIGURES = {
+    "precision": ("precision.png", precision_figure),
+    "calibration": ("outages.png", outage_figure),
+    "reliability": ("reliability.png", reliability_figure),
+}
+_KIND = ("task", "method", "trained_on", "noise_sigma", "point")
 
 
 def run(config: dict[str, Any]) -> int:
-    """Diagnose and write tables and figures.
+    """Diagnose and write tables and figures, or draw these anew.
 
     Args:
         config: see conf/diagnose.yaml.
@@ -50,16 +48,12 @@ def run(config: dict[str, Any]) -> int:
         The exit status.
     """
     if config["redraw"] is not None:
-        return _redraw(Path(config["redraw"]))
-    if config["run"] is None:
-        raise UserError("`run` must name run folders: run=<folder> or 'run=runs/*'.")
+        return _draw(Path(config["redraw"]))
     check_mode(config["mode"])
     class_names(config["bins"])
-    if config["episodes"] < 1:
-        raise UserError(f"`episodes` must be positive, got {config['episodes']}.")
-    if config["resamples"] < 2:
-        raise UserError(f"`resamples` must be 2 or more, got {config['resamples']}.")
-    check_reduction_seed(config["reduction_seed"])
+    for name, least in (("episodes", 1), ("resamples", 2)):
+        if config[name] < least:
+            raise UserError(f"`{name}` must be {least} or more, got {config[name]}.")
     if not config["points"]:
         raise UserError("`points` must hold at least one, such as trained or mcar:0.5.")
     folders = find_folders(config["run"])
@@ -68,137 +62,108 @@ def run(config: dict[str, Any]) -> int:
     out = Path(config["out"] or folders[0])
     if out.exists() and not out.is_dir():
         raise UserError(f"`out` must be a folder, {out} is a file.")
-    folders = with_checkpoint(folders)
     torch.set_num_threads(config["threads"])
-    options = {"resamples": config["resamples"], "seed": config["seed"]}
-    precision: list[dict[str, Any]] = []
-    calibration: list[dict[str, Any]] = []
-    reliability: list[dict[str, Any]] = []
-    series: dict[tuple[str, str, str, str, float], list[Tally]] = {}
-    for folder, trained, point, tally in _diagnoses(folders, config):
-        common = _common(folder, trained, point, config["mode"], tally)
-        precision += [common | row for row in precision_rows(tally, **options)]
-        calibration += [common | row for row in calibration_rows(tally, **options)]
-        reliability += [common | row for row in reliability_rows(tally)]
-        sigma = trained.settings.noise.sigma
-        kind = (common["task"], common["point"], common["method"], common["trained_on"], sigma)
-        series.setdefault(kind, []).append(tally)
-    if not precision:
+    groups: dict[tuple[Any, ...], list[tuple[dict[str, Any], Tally]]] = {}
+    for common, tally in _diagnoses(with_checkpoint(folders), config):
+        groups.setdefault(tuple(common[name] for name in _KIND), []).append((common, tally))
+    if not groups:
         raise UserError("no point is left: every belief diverged, see above. Name other `points`.")
+    tables: dict[str, list[dict[str, Any]]] = {name: [] for name in _FIGURES}
+    for members in groups.values():
+        if len(members) > 1:  # and all of them together
+            together = pool([tally for _, tally in members])
+            common = members[0][0] | {"run": "all", "training_seed": None, "runs": len(members)}
+            members.append((common | _sizes(together), together))
+        for common, tally in members:
+            options = {"resamples": config["resamples"], "seed": config["seed"]}
+            tables["precision"] += [common | row for row in precision_rows(tally, **options)]
+            tables["calibration"] += [common | row for row in calibration_rows(tally, **options)]
+            tables["reliability"] += [common | row for row in reliability_rows(tally)]
     out.mkdir(parents=True, exist_ok=True)
-    write_table(out / "precision.csv", precision)
-    for name, rows in (("calibration.csv", calibration), ("reliability.csv", reliability)):
+    for name, rows in tables.items():
         if rows:
-            write_table(out / name, rows)
+            text = pd.DataFrame(rows).to_csv(index=False, float_format="%.6g")
+            write_whole(out / f"{name}.csv", text)
         else:
-            (out / name).unlink(missing_ok=True)  # of an earlier diagnosis, no longer true
-    pooled = _pooled(series)
-    figures = (
-        precision_figure(pooled, **options),
-        outage_figure(pooled, **options),
-        reliability_figure(pooled),
-    )
-    for name, figure in zip(_FIGURES, figures, strict=True):
+            (out / f"{name}.csv").unlink(missing_ok=True)  # of an earlier diagnosis
+    return _draw(out)
+
+
+def _draw(folder: Path) -> int:
+    """Draw the figures of the tables in a folder."""
+    if not (folder / "precision.csv").is_file():
+        raise UserError(f"`redraw` must be the folder of a diagnosis, {folder} has no tables.")
+    for table, (name, draw) in _FIGURES.items():
+        path = folder / f"{table}.csv"
+        figure = draw(pd.read_csv(path)) if path.is_file() else None
         if figure is None:
-            (out / name).unlink(missing_ok=True)
+            (folder / name).unlink(missing_ok=True)
         else:
-            save_figure(figure, out / name, dpi=100)
-    say(f"{len(folders)} run{'s' if len(folders) > 1 else ''}, written: {out}")
+            save_figure(figure, folder / name, dpi=100)
+    say(f"written: {folder}")
     return 0
-
-
-def _redraw(folder: Path) -> int:
-    """Draw the outage figure of a diagnosis anew from its table."""
-    table, path = folder / "calibration.csv", folder / _FIGURES[1]
-    if not table.is_file():
-        raise UserError(
-            f"`redraw` must be the folder of a diagnosis, {folder} has no {table.name}."
-        )
-    figure = draw_outages(read_outages(table))
-    if figure is None:
-        raise UserError(f"`{table}` holds no reading that was held against a forecast.")
-    save_figure(figure, path, dpi=100)
-    say(f"written: {path}")
-    return 0
-
-
-def _pooled(series: Mapping[tuple[str, str, str, str, float], list[Tally]]) -> list[Series]:
-    """Put the runs of one task, point, method and kind of training together."""
-    # What it was trained on is told by the figures; sigma is told here where it differs.
-    labels = training_labels((method, "", sigma) for *_, method, _, sigma in series)
-    return [
-        Series(task, point, labels[method, "", sigma], trained_on, len(tallies), pool(tallies))
-        for (task, point, method, trained_on, sigma), tallies in series.items()
-    ]
 
 
 def _diagnoses(
     folders: list[Path], config: dict[str, Any]
-) -> Iterator[tuple[Path, TrainedAgent, Point, Tally]]:
-    """Yield a tally for each run and point, and say in a line what it came to."""
+) -> Iterator[tuple[dict[str, Any], Tally]]:
+    """Yield the columns and the tally of each run and point, and print a line of each."""
+    options = {name: config[name] for name in ("episodes", "mode", "seed", "bins")}
     for folder in folders:
         trained = load_trained_agent(folder)
+        settings = trained.settings
+        belief = str(settings.belief.get("name", ""))
         if trained.belief.observing is None:
-            name = trained.settings.belief.get("name")
             say(
-                f"{folder.name}: belief={name} keeps no estimate of its sensors; the rows are "
+                f"{folder.name}: belief={belief} keeps no estimate of its sensors; the rows are "
                 "those of the last value and the running mean"
             )
-        texts = [str(point) for point in config["points"]]
-        for point in parse_points(texts, trained.settings, float(config["spike_std"])):
+        spike_std = float(config["spike_std"])
+        for condition in parse_conditions(config["points"], settings, spike_std=spike_std):
             removed = removed_sensors(
-                point,
+                condition,
                 trained,
                 episodes=config["episodes"],
                 reduction_seed=config["reduction_seed"],
             )
             try:
-                tally = diagnose(
-                    trained,
-                    point.missingness,
-                    noise=point.noise,
-                    removed=removed,
-                    episodes=config["episodes"],
-                    mode=config["mode"],
-                    seed=config["seed"],
-                    bins=config["bins"],
-                )
+                tally = diagnose(trained, condition, removed, **options)
             except BeliefDivergedError as error:
-                say(f"{folder.name}, {point.name}: no rows, {error}")
+                say(f"{folder.name}, {condition.name}: no rows, {error}")
                 continue
-            say(_summary(folder, point, tally))
-            yield folder, trained, point, tally
+            say(_summary(folder, condition.name, tally))
+            yield (
+                {
+                    "run": folder.name,
+                    "task": settings.env.env_id,
+                    "belief": belief,
+                    "method": trained.method,
+                    "training_seed": settings.seed,
+                    "trained_on": missingness_name(settings.missingness),
+                    "noise_sigma": settings.noise.sigma,
+                    "point": condition.name,
+                    "mode": config["mode"],
+                    "runs": 1,
+                }
+                | _sizes(tally),
+                tally,
+            )
 
 
-def _summary(folder: Path, point: Point, tally: Tally) -> str:
+def _sizes(tally: Tally) -> dict[str, Any]:
+    return {"missing_ratio": tally.missing_ratio, "episodes": len(tally.lengths)}
+
+
+def _summary(folder: Path, point: str, tally: Tally) -> str:
     """Return a line: the error of each estimate where sensors are missing, NIS over entries."""
-    parts = [f"{folder.name}, {point.name}, missing {tally.missing_ratio:.3f}"]
+    parts = [f"{folder.name}, {point}, missing {tally.missing_ratio:.3f}; RMSE of missing sensors"]
     for row in precision_rows(tally, resamples=2, seed=0):
         if row["entries"] == "missing" and row["steps_since_seen"] == "all":
             parts.append(f"{row['estimate']} {row['rmse']:.3f}")
     for row in calibration_rows(tally, resamples=2, seed=0):
         if row["held_against"] == "reading" and row["steps_since_seen"] == "all":
             parts.append(f"NIS/entries {row['nis_per_dof']:.2f}")
-    return "; ".join([parts[0], "RMSE of missing sensors", *parts[1:]])
-
-
-def _common(
-    folder: Path, trained: TrainedAgent, point: Point, mode: str, tally: Tally
-) -> dict[str, Any]:
-    """Return the columns that all rows of a run at a point have."""
-    settings = trained.settings
-    return {
-        "run": folder.name,
-        "task": settings.env.env_id,
-        "belief": str(settings.belief.get("name", "")),
-        "method": trained.method,
-        "training_seed": settings.seed,
-        "trained_on": missingness_name(settings.missingness),
-        "point": point.name,
-        "missing_ratio": tally.missing_ratio,
-        "mode": mode,
-        "episodes": len(tally.lengths),
-    }
+    return "; ".join(parts)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="diagnose")

@@ -2,13 +2,12 @@
 
 The last checkpoint of each run acts under other gaps, outages, noise and spikes than it was trained
 with, with frozen normalisation. One row an episode goes to a CSV file that is written whole after
-every point: the same command goes on where an evaluation was stopped. The figures show the mean
+every condition: the same command goes on where an evaluation was stopped. The figures show the mean
 with its 95 % interval over the nominal and the realised missing ratio.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,27 +16,18 @@ from typing import Any
 import hydra
 import pandas as pd
 from analysis.figures import draw_evaluation
-from analysis.runs import EPISODE_TABLES, find_folders
-from evaluation.conditions import Point, check_reduction_seed, identity
-from evaluation.grid import (
-    Grid,
-    Protocol,
-    Results,
-    evaluate_tasks,
-    grid_points,
-    parse_points,
-)
+from analysis.runs import EPISODE_TABLES
+from evaluation.conditions import Condition, default_conditions, parse_conditions
+from evaluation.folders import find_folders, with_checkpoint
 from evaluation.sensor_choice import kept_sensors
-from evaluation.trained import TrainedAgent, gated, load_trained_agent, with_checkpoint
+from evaluation.table import Protocol, Table, evaluate_tasks, identity
+from evaluation.trained import TrainedAgent, load_trained_agent
 from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.config import check_mode
 from training.console import say, start
 from training.errors import UserError
 from training.sensor_groups import have_names
-from training.sensors import sensor_names
-
-from torchrl_drbpn.functional.robust import check_gate
 
 
 def run(config: dict[str, Any]) -> int:
@@ -49,133 +39,95 @@ def run(config: dict[str, Any]) -> int:
     Returns:
         The exit status.
     """
-    folders, protocol = _folders(config), _protocol(config)
-    output = _output(config, folders)
-    folders = with_checkpoint(folders)
-    agents = {folder: gated(load_trained_agent(folder), protocol.gate) for folder in folders}
-    wanted = [(f, point) for f in folders for point in _points(config, f.name, agents[f])]
-    results = Results(
-        output,
-        protocol,
-        {folder.name: identity(agent) for folder, agent in agents.items()},
-        overwrite=config["overwrite"],
-    )
-    lacking = [(folder, point, results.lacks(folder.name, point)) for folder, point in wanted]
-    tasks = [task for task in lacking if task[2]]
-    if len(tasks) < len(wanted):
-        say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
-    order = [(folder.name, point.name) for folder, point in wanted]
-    processes = config["processes"] or _cores()
-    for done, (folder, point, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
-        results.add(folder.name, point.name, rows)
-        say(f"{done}/{len(tasks)} {folder.name} {point.name}: {_summary(rows)}")
-    results.arrange(order)
-    results.write()
-    say(f"written: {output}")
-    if config["figures"]:
-        for task, figure in draw_evaluation(pd.read_csv(output)).items():
-            path = output.with_name(f"{output.stem}-{task}.png")
-            save_figure(figure, path, dpi=120)
-            say(f"written: {path}")
-    return 0
-
-
-def _cores() -> int:
-    """Return how many cores this process may use; all of them where the system does not tell."""
-    allowed = getattr(os, "sched_getaffinity", None)  # not on macOS
-    return len(allowed(0)) if allowed else os.cpu_count() or 1
-
-
-def _folders(config: dict[str, Any]) -> list[Path]:
-    if config["run"] is None:
-        raise UserError("`run` must name a run folder: run=runs/<folder>.")
-    folders = find_folders(config["run"])
+    folders, protocol = find_folders(config["run"]), _protocol(config)
     names = [folder.name for folder in folders]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(
             f"`run` must name folders with different names, {', '.join(twice)} comes twice: "
             "evaluate them by themselves."
         )
-    return folders
+    output, folders = _output(config, folders), with_checkpoint(folders)
+    agents = {folder: load_trained_agent(folder, protocol.gate) for folder in folders}
+    wanted = [(f, condition) for f in folders for condition in _conditions(config, f, agents[f])]
+    table = Table(
+        output,
+        protocol,
+        {folder.name: identity(agent) for folder, agent in agents.items()},
+        overwrite=config["overwrite"],
+    )
+    lacking = [(f, c, table.lacks(f.name, c, config["modes"])) for f, c in wanted]
+    tasks = [task for task in lacking if task[2]]
+    if len(tasks) < len(wanted):
+        say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
+    # macOS does not tell how many cores a process may use.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    processes = config["processes"] or cores or 1
+    for done, (task, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
+        table.add(rows)
+        say(f"{done}/{len(tasks)} {task[0].name} {task[1].name}: {_summary(rows)}")
+    table.arrange([(folder.name, condition.name) for folder, condition in wanted])
+    table.write()
+    say(f"written: {output}")
+    if config["figures"]:
+        for env_id, figure in draw_evaluation(pd.read_csv(output)).items():
+            path = output.with_name(f"{output.stem}-{env_id}.png")
+            save_figure(figure, path, dpi=120)
+            say(f"written: {path}")
+    return 0
 
 
 def _protocol(config: dict[str, Any]) -> Protocol:
     for name in ("episodes", "threads", "processes"):
         value = config[name]
-        if (value is not None or name != "processes") and (
-            not isinstance(value, int) or isinstance(value, bool) or value < 1
-        ):
+        unset = value is None and name == "processes"
+        if not unset and (type(value) is not int or value < 1):
             raise UserError(f"`{name}` must be a whole number of at least 1, got {value!r}.")
-    check_reduction_seed(config["reduction_seed"])
-    if config["gate"] is not None:
-        try:
-            check_gate(config["gate"])
-        except ValueError as error:
-            raise UserError(str(error)) from error
     if not config["modes"]:
         raise UserError("`modes` must hold sampled, mean or both, got none.")
     for mode in config["modes"]:
         check_mode(mode)
-    return Protocol(
-        episodes=config["episodes"],
-        modes=list(config["modes"]),
-        seed=config["seed"],
-        spike_std=float(config["spike_std"]),
-        reduction_seed=config["reduction_seed"],
-        threads=config["threads"],
-        gate=config["gate"],
-    )
+    names = ("episodes", "seed", "reduction_seed", "threads", "gate")
+    return Protocol(**{name: config[name] for name in names})
 
 
 def _output(config: dict[str, Any], folders: Sequence[Path]) -> Path:
-    name, gate = Path(EPISODE_TABLES[config["points"] is not None]), config["gate"]
-    place = folders[0] if len(folders) == 1 else Path()
-    if gate is not None:
+    name = Path(EPISODE_TABLES[config["points"] is not None])
+    given = config["output"] and Path(config["output"])
+    if config["gate"] is not None:
+        name = name.with_name(f"{name.stem}-gate{config['gate']}{name.suffix}")
         # Reports read the tables of these names as those of the agent as it was trained.
-        name = name.with_name(f"{name.stem}-gate{gate:g}{name.suffix}")
-        if config["output"] and Path(config["output"]).name in EPISODE_TABLES:
+        if given and given.name in EPISODE_TABLES:
             raise UserError(
-                f"`output` must not be called {Path(config['output']).name} with a gate, as "
-                f"reports would read it as without: take {name} or another name."
+                f"`output` must not be called {given.name} with a gate, as reports would read it "
+                f"as without: take {name} or another name."
             )
-    output = Path(config["output"] or place / name)
+    output: Path = given or (folders[0] if len(folders) == 1 else Path()) / name
     if not output.parent.is_dir():
         raise UserError(f"`output` must lie in an existing folder, got {output}.")
     return output
 
 
-def _points(config: dict[str, Any], name: str, trained: TrainedAgent) -> list[Point]:
-    """Return the points that a run is evaluated at."""
+def _conditions(config: dict[str, Any], folder: Path, trained: TrainedAgent) -> list[Condition]:
+    """Return what a run is evaluated under."""
     texts = config["points"]
     if texts is None:
+        model, levels = True, dict(config["grid"])
         try:
             kept_sensors(trained, 0)
-            model = True
         except UserError as error:
             model = False
-            say(f"{name}: sensors are removed at random only; {error}")
-        grid = Grid(**config["grid"])
-        if config["full"] and not have_names(_sensor_names(trained)):
-            grid = dataclasses.replace(grid, outage_groups=["sensor"])
-            say(
-                f"{name}: outages of single sensors only; those of {trained.settings.env.env_id} "
-                "have no names to group them by"
-            )
-        texts = grid_points(grid, full=config["full"], model=model)
-    texts = [str(text) for text in ([texts] if isinstance(texts, str) else texts)]
-    return parse_points(texts, trained.settings, float(config["spike_std"]))
-
-
-def _sensor_names(trained: TrainedAgent) -> list[str]:
-    env = trained.settings.env
-    shape = trained.statistics.observation_spec["observation"].shape
-    return sensor_names(env.id, env.version, shape[-1])
+            say(f"{folder.name}: sensors are removed at random only; {error}")
+        if config["full"] and not have_names(trained.sensors):
+            levels["outage_groups"] = ["sensor"]
+            say(f"{folder.name}: outages of single sensors only, these have no names to group by")
+        texts = default_conditions(levels, full=config["full"], model=model)
+    listed = [texts] if isinstance(texts, str) else texts
+    return parse_conditions(listed, trained.settings, spike_std=float(config["spike_std"]))
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> str:
-    steps = sum(row["length"] for row in rows)
-    missing = sum(row["missing_ratio"] * row["length"] for row in rows) / steps
-    parts = [f"missing {missing:.3f}"]
+    missing = sum(row["missing_ratio"] * row["length"] for row in rows)
+    parts = [f"missing {missing / sum(row['length'] for row in rows):.3f}"]
     for mode in dict.fromkeys(row["mode"] for row in rows):
         returns = [row["return"] for row in rows if row["mode"] == mode]
         parts.append(f"{mode} {sum(returns) / len(returns):.1f}")

@@ -1,8 +1,8 @@
-"""Film an agent at work: ``python recipes/play.py run=<folder> point=mcar:0.5``.
+"""Show an agent at work: ``python recipes/play.py run=<folder> point=mcar:0.5 out=film.gif``.
 
-The last checkpoint of the run acts for one episode. Each frame shows the robot, which of its
-sensors arrive at that step and, for some of them, the latest steps: the true value, what arrived,
-the gaps, and the belief with its 95 % interval. An agent without a belief is shown with its sensors
+The agent acts for one episode. The film, or the picture with ``out=belief.png``, shows the robot,
+which of its sensors arrive at each step and, for some of them, the true value, what arrived, the
+gaps, and the belief with its 95 % interval. An agent without a belief is shown with its sensors
 alone.
 """
 
@@ -13,24 +13,23 @@ from typing import Any
 
 import hydra
 import torch
-from evaluation.conditions import check_reduction_seed, parse_point, removed_sensors
+from evaluation.conditions import parse_condition, removed_sensors
 from evaluation.trained import load_trained_agent
 from omegaconf import DictConfig
-from rendering.belief_figure import chosen_sensors
-from rendering.film import Film, Frame, robot_size
-from rendering.frames import render_or_say
-from rendering.trajectory import Recording, record_episode
-from rendering.video_file import check_video, write_video
-from training.config import check_mode, missingness_name
+from rendering.belief_figure import chosen_sensors, draw_belief, save_figure
+from rendering.trajectory import record_episode
+from rendering.video import Film, check_video, robot_size, write_video
+from training.config import check_mode
 from training.console import say, start
 from training.errors import UserError
 
-_WIDTHS = (240, 1920)  # pixels
-_COLOURS = (8, 256)
+_FORMATS = (".gif", ".mp4", ".png")
+_RANGES = {"size": (240, 1920), "colours": (8, 256)}
+_STRIP = (248, 330)  # pixels of a picture of the robot above the panels of a figure
 
 
 def run(config: dict[str, Any]) -> int:
-    """Record an episode and film it.
+    """Record an episode and show it.
 
     Args:
         config: see conf/play.yaml.
@@ -38,77 +37,86 @@ def run(config: dict[str, Any]) -> int:
     Returns:
         The exit status.
     """
-    out = _check(config)
+    out, first = _check(config), config["start"]
     torch.set_num_threads(config["threads"])
     trained = load_trained_agent(Path(config["run"]))
-    point = parse_point(str(config["point"]), trained.settings, spike_std=config["spike_std"])
-    # Panels of the first frame look back too.
-    begin = max(0, config["start"] - config["window"] + 1)
+    text, spike_std = str(config["point"]), float(config["spike_std"])
+    condition = parse_condition(text, trained.settings, spike_std=spike_std)
+    still = out.suffix == ".png"
+    # Panels of the first frame of a film look back too.
+    begin = first if still else max(0, first - config["window"] + 1)
+    removed = removed_sensors(
+        condition, trained, episodes=1, reduction_seed=config["reduction_seed"]
+    )
+    size = _STRIP if still else robot_size(config["size"])
     recording = record_episode(
         trained,
-        point.missingness,
-        noise=point.noise,
-        removed=removed_sensors(
-            point, trained, episodes=1, reduction_seed=config["reduction_seed"]
-        ),
+        condition,
+        removed,
         mode=config["mode"],
         seed=config["seed"],
         start=begin,
-        steps=config["start"] - begin + config["steps"],
+        steps=first - begin + config["steps"],
+        picture_size=size if config["robot"] else None,
     )
-    steps = range(config["start"] - begin, len(recording.poses), config["every"])
+    steps = range(first - begin, len(recording.steps), config["every"])
     if not steps:
         raise UserError(
             "`start` must lie inside the episode, which ended after "
-            f"{begin + len(recording.poses)} steps."
+            f"{begin + len(recording.steps)} steps."
         )
     sensors = chosen_sensors(recording, config["sensors"])
-    shown = point.name
-    if str(config["point"]) == "trained":
-        shown = f"{missingness_name(trained.settings.missingness)}, as in training"
-    film = Film(
-        recording,
-        sensors,
-        _robot(recording, steps, config["size"]) if config["robot"] else [],
-        steps=steps,
-        window=config["window"],
-        width=config["size"],
-        title=f"{recording.task}  {trained.settings.belief.get('name')}  {shown}",
-    )
-    write_video(out, film, fps=config["fps"], colours=config["colours"])
+    shown = f"{condition.name}{', as in training' if text == 'trained' else ''}"
+    belief = trained.settings.belief.get("name")
+    if still:
+        after = f"after {trained.frames:,} training steps, {config['mode']} actions"
+        title = f"{recording.task}, {belief}, {shown}, {after}"
+        figure = draw_belief(recording, sensors, pictures=config["frames"], title=title)
+        save_figure(figure, out, dpi=120)
+        what = (
+            f"the 95 % intervals hold {100 * recording.coverage:.1f} % of the missing entries"
+            if recording.told == "estimate" and recording.coverage >= 0
+            else "one figure"
+        )
+    else:
+        film = Film(
+            recording,
+            sensors,
+            steps=steps,
+            window=config["window"],
+            width=config["size"],
+            title=f"{recording.task}  {belief}  {shown}",
+        )
+        write_video(out, film, fps=config["fps"], colours=config["colours"])
+        what = f"{len(film)} frames of {film.width} x {film.height}"
     missing = 1 - recording.observed[steps.start :].mean()
     say(
-        f"{len(film)} frames of {film.width} x {film.height}, steps {config['start']} to "
-        f"{begin + steps[-1]}, missing {missing:.3f}; written: {out} "
+        f"steps {first} to {begin + steps[-1]}, missing {missing:.3f}, {what}; written: {out} "
         f"({out.stat().st_size / 1e6:.2f} MB)"
     )
     return 0
 
 
 def _check(config: dict[str, Any]) -> Path:
-    """Refuse what can't be filmed, before an agent is loaded; return where the film goes."""
-    if config["run"] is None:
-        raise UserError("`run` must name a run folder: run=runs/<folder>.")
-    for name, least in (("steps", 1), ("every", 1), ("window", 2), ("start", 0)):
-        if config[name] < least:
-            raise UserError(f"`{name}` must be {least} or more, got {config[name]}.")
-    for name, (least, most) in (("size", _WIDTHS), ("colours", _COLOURS)):
-        if not least <= config[name] <= most:
-            raise UserError(f"`{name}` must be in [{least}, {most}], got {config[name]}.")
+    """Refuse what can't be shown, before an agent is loaded; return where it goes."""
+    if config["run"] is None or not Path(config["run"]).is_dir():
+        raise UserError(f"`run` must name a run folder: run=runs/<folder>, got {config['run']}.")
+    least = {"steps": 1, "every": 1, "window": 2, "start": 0, "frames": 0}
+    for name, value in least.items():
+        if config[name] < value:
+            raise UserError(f"`{name}` must be {value} or more, got {config[name]}.")
+    for name, (low, high) in _RANGES.items():
+        if not low <= config[name] <= high:
+            raise UserError(f"`{name}` must be in [{low}, {high}], got {config[name]}.")
     check_mode(config["mode"])
-    check_reduction_seed(config["reduction_seed"])
     out = Path(config["out"] or Path(config["run"]) / "play.gif")
-    if not Path(config["run"]).is_dir():
-        raise UserError(f"`run` must be a run folder, got {config['run']}.")
-    check_video(out, config["fps"])
+    if not out.parent.is_dir():
+        raise UserError(f"`out` must lie in an existing folder, got {out}.")
+    if out.suffix not in _FORMATS:
+        raise UserError(f"`out` must end in .gif, .mp4 or .png, got {out.name}.")
+    if out.suffix != ".png":
+        check_video(out, config["fps"])
     return out
-
-
-def _robot(recording: Recording, steps: range, size: int) -> list[Frame]:
-    """Draw the robot at each step, where that can be done."""
-    width, height = robot_size(size)
-    poses = [recording.poses[step] for step in steps]
-    return render_or_say(recording.model, recording.task, poses, width=width, height=height)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="play")

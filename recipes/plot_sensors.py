@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 import hydra
 import torch
-from analysis.runs import find_folders
 from analysis.sensor_figures import covariance_figure, ranking_figure
+from evaluation.folders import find_folders, with_checkpoint
 from evaluation.sensor_choice import SensorModel, learned_sensors
-from evaluation.trained import TrainedAgent, load_trained_agent, with_checkpoint
+from evaluation.trained import TrainedAgent, load_trained_agent
 from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.config import missingness_name

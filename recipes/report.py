@@ -16,8 +16,9 @@ import hydra
 import pandas as pd
 from analysis.figures import learning_curves, robustness
 from analysis.page import page
-from analysis.runs import Study, find_folders, read_runs, write_table
+from analysis.runs import Study, read_runs, write_table
 from analysis.tables import derived_tables
+from evaluation.folders import find_folders
 from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.console import say, start

@@ -1,4 +1,4 @@
-"""What the tests of evaluate.py share: short runs to evaluate, and the command as it is called."""
+"""What the tests of evaluate, diagnose and play share: short runs, and the commands as called."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from typing import Any
 import pytest
 
 pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
 from recipe_tools import ROOT, make_config  # isort: skip
 
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 import torch
+from evaluation.conditions import Condition, parse_condition
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from training.config import Settings
 from training.run import run as train
 
 SMOKE = (
@@ -35,16 +38,24 @@ def trained_folder(folder: Path, *overrides: str) -> Path:
     return folder
 
 
-def configured(*overrides: str) -> dict[str, Any]:
+def configured(command: str = "evaluate", *overrides: str) -> dict[str, Any]:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        composed = OmegaConf.to_container(compose("evaluate", list(overrides)), resolve=True)
+        composed = OmegaConf.to_container(compose(command, list(overrides)), resolve=True)
     assert isinstance(composed, dict)
     return {str(key): value for key, value in composed.items()}
 
 
+def parse(text: str, settings: Settings) -> Condition:
+    return parse_condition(text, settings, spike_std=5.0)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def evaluate(table: Path, *runs: Path, points: str = "", **options: Any) -> list[dict[str, str]]:
-    base = configured(*([f"points=[{points}]"] if points else []))
+    base = configured("evaluate", *([f"points=[{points}]"] if points else []))
     base |= {"run": [str(r) for r in runs], "output": str(table), "processes": 1, "episodes": 2}
     assert recipe.run(base | {"figures": False} | options) == 0
-    with table.open(newline="") as file:
-        return list(csv.DictReader(file))
+    return read_rows(table)

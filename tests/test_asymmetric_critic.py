@@ -190,17 +190,16 @@ def test_a_stopped_run_goes_on_to_the_last_bit():
 
 
 def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path: Path):
-    from evaluation.episodes import evaluate, make_evaluation_environment
+    from evaluation.episodes import evaluate
     from evaluation.trained import load_trained_agent
     from training.run import run
 
     with torch.random.fork_rng():
         assert run(make_config(*SMOKE, "total_frames=128"), tmp_path / "run") == 0
         trained = load_trained_agent(tmp_path / "run")
-    env = make_evaluation_environment(trained.settings, trained.belief, trained.agent, episodes=2)
-    assert COMPLETE not in env.reset()
-    policy, statistics = trained.agent.policy, trained.statistics
-    result = evaluate(policy, env, mode="mean", seed=0, statistics=statistics)
+    make_env = trained.environments()
+    assert COMPLETE not in make_env(0).reset()
+    result = evaluate(trained.agent.policy, make_env, episodes=2, mode="mean", seed=0)
     assert result is not None
     table = recipe_tools.read_table(tmp_path / "run" / "evaluation.csv")
     assert {row["kind"] for row in table} == {"final"}

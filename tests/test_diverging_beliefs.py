@@ -16,19 +16,16 @@ import torch
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from evaluation_tools import SMOKE, evaluate, trained_folder  # isort: skip
+from evaluation_tools import SMOKE, evaluate, parse, trained_folder  # isort: skip
 
 import diagnose as diagnose_recipe
 from analysis.calibration import diagnose
-from evaluation import grid as evaluation_grid
-from evaluation.conditions import parse_point
-from evaluation.grid import agent_of, evaluate_tasks
+from evaluation.table import Protocol, evaluate_condition
 from evaluation.trained import TrainedAgent, load_trained_agent
 from recipe_tools import make_config
 from training.config import Settings, read_settings
 from training.console import run_or_explain
 from training.errors import UserError
-from training.run_folder import write_table
 
 from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
 
@@ -55,9 +52,9 @@ def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
 def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
-    point = parse_point("mcar:0.5", settings, spike_std=5.0)
-    protocol = evaluation_grid.Protocol(3, ["sampled"], 1, 5.0, 0, 1, None)
-    ((_, _, expected),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+    point = parse("mcar:0.5", settings)
+    trained, protocol = load_trained_agent(drbpn), Protocol(3, 1, 0, 1, None)
+    expected = evaluate_condition(trained, point, ["sampled"], protocol)
     step, calls, actions = BeliefFilter.step, [], []
 
     def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
@@ -74,7 +71,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     advance = GymnasiumBatchEnv._advance
     monkeypatch.setattr(BeliefFilter, "step", diverge)
     monkeypatch.setattr(GymnasiumBatchEnv, "_advance", look)
-    ((_, _, found),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+    found = evaluate_condition(trained, point, ["sampled"], protocol)
     assert [row["diverged"] for row in found] == [0, 1, 0]
     assert found[1]["log_likelihood"] is None
     assert np.isfinite([row["return"] for row in found]).all()
@@ -85,7 +82,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     assert len(stopped) > 0
     assert (stopped == 0).all()
     assert (np.stack(actions)[:2, 1] != 0).all()
-    assert agent_of(drbpn, None).agent.belief.filter.validate  # who asks by himself is told
+    assert trained.agent.belief.filter.validate  # who asks by himself is told
 
 
 @pytest.mark.parametrize("command", ["evaluate", "diagnose"])
@@ -101,15 +98,14 @@ def test_the_belief_of_an_episode_that_is_over_goes_no_further(
         return step(self, *args, **options)
 
     monkeypatch.setattr(BeliefFilter, "step", look)
-    point = parse_point("mcar:0.5", settings, spike_std=5.0)
+    point = parse("mcar:0.5", settings)
     if command == "evaluate":
-        protocol = evaluation_grid.Protocol(4, ["sampled"], 1, 5.0, 0, 1, None)
-        ((_, _, rows),) = evaluate_tasks([(drbpn, point, ["sampled"])], protocol, 1)
+        protocol = Protocol(4, 1, 0, 1, None)
+        rows = evaluate_condition(load_trained_agent(drbpn), point, ["sampled"], protocol)
         lengths = [row["length"] for row in rows]
     else:
         tally = diagnose(
-            load_trained_agent(drbpn), point.missingness, episodes=4, mode="sampled", seed=1,
-            bins=[1, 2],
+            load_trained_agent(drbpn), point, episodes=4, mode="sampled", seed=1, bins=[1, 2]
         )  # fmt: skip
         lengths = tally.lengths.int().tolist()
     assert len(set(lengths)) > 1
@@ -140,17 +136,6 @@ def test_the_next_evaluation_begins_with_every_robot(
     assert shares == {"sampled": {"1"}, "mean": {"0"}}
 
 
-def test_tables_without_room_for_stopped_episodes_are_gone_on_with(
-    drbpn: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out.csv"
-    rows = evaluate(out, drbpn, points="none:0")
-    write_table(out, [{k: v for k, v in row.items() if k != "diverged"} for row in rows])
-    again = evaluate(out, drbpn, points="none:0,'mcar:0.5'")
-    assert again[: len(rows)] == rows
-    assert {row["diverged"] for row in again} == {"0"}
-
-
 def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
     drbpn: Path,
     tmp_path: Path,
@@ -159,10 +144,10 @@ def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
 ) -> None:
     whole = diagnose_recipe.diagnose
 
-    def diverging(trained: TrainedAgent, missingness: Any, **how: Any) -> Any:
-        if missingness.eta == 0.8:
+    def diverging(trained: TrainedAgent, condition: Any, removed: Any, **how: Any) -> Any:
+        if condition.missingness.eta == 0.8:
             raise BeliefDivergedError("the belief is no longer finite")
-        return whole(trained, missingness, **how)
+        return whole(trained, condition, removed, **how)
 
     monkeypatch.setattr(diagnose_recipe, "diagnose", diverging)
     assert run_diagnosis(drbpn, tmp_path, points=["mcar:0.8", "mcar:0.4"]) == 0

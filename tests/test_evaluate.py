@@ -1,18 +1,18 @@
-"""The evaluation recipe: points, the grid, the table that grows point by point, the figures.
+"""The evaluation recipe: conditions, episodes, the table that grows condition by condition.
 
-A point names one thing and leaves the rest as in training; its full name reads back to itself. The
-table holds whole points: one that was stopped goes on, to the same bytes as one that was not, and
-never mixes settings. Sensors that fail together share a joint or a kind. The interval of a mean is
-that of its runs and episodes.
+A condition names one thing and leaves the rest as in training; its full name reads back to itself.
+Every episode draws from a stream of its own, so that more episodes only add. The table holds whole
+conditions: one that was stopped goes on, to the same bytes as one that was not, and never mixes
+settings. Folders are found whatever their names hold.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
+import shlex
 import shutil
+import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,33 +21,26 @@ import pytest
 import torch
 
 pytest.importorskip("hydra")
-from evaluation_tools import SMOKE, configured, evaluate, trained_folder  # isort: skip
+from evaluation_tools import SMOKE, configured, evaluate, parse, read_rows, trained_folder
+
 from recipe_tools import ROOT, make_config  # isort: skip
 
-sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 import pandas as pd
 from analysis.figures import draw_evaluation
-from evaluation import grid as evaluation_grid
-from evaluation.conditions import Point, evaluate_points, parse_point, removed_sensors
-from evaluation.episodes import Episodes
-from evaluation.grid import Grid, evaluate_tasks, grid_points
+from evaluation import episodes as episodes_room
+from evaluation import table as table_room
+from evaluation.conditions import default_conditions, removed_sensors
+from evaluation.episodes import Episodes, StoppingPolicy, run_episodes
+from evaluation.folders import find_folders, override
 from evaluation.sensor_choice import kept_sensors
+from evaluation.table import evaluate_tasks
 from evaluation.trained import TrainedAgent, load_trained_agent
 from training.config import Settings, read_settings
 from training.errors import UserError
 from training.run_folder import read_config, write_config
-from training.sensor_groups import sensor_groups
-from training.sensors import named_tasks, sensor_names
 
 from torchrl_drbpn.functional import draw_mechanism
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _threads() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -70,11 +63,7 @@ def settings() -> Settings:
     return read_settings(make_config(*SMOKE))
 
 
-def parse(text: str, settings: Settings) -> Point:
-    return parse_point(text, settings, spike_std=5.0)
-
-
-# Points ---------------------------------------------------------------------------------------
+# Conditions -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -91,17 +80,17 @@ def parse(text: str, settings: Settings) -> Point:
         ("spikes:0.05:2", "spikes:0.05:2"),
     ],
 )
-def test_the_full_name_of_a_point_reads_back_to_it(
+def test_the_full_name_of_a_condition_reads_back_to_it(
     text: str, name: str, settings: Settings
 ) -> None:
-    point = parse(text, settings)
-    assert point.name == name
-    assert parse(name, settings) == point
+    condition = parse(text, settings)
+    assert condition.name == name
+    assert parse(name, settings) == condition
 
 
-def test_a_point_leaves_what_it_does_not_name_as_in_training(settings: Settings) -> None:
-    assert parse("noise:3", settings).missingness == settings.missingness
-    assert parse("spikes:0.1", settings).missingness == settings.missingness
+def test_a_condition_leaves_what_it_does_not_name_as_in_training(settings: Settings) -> None:
+    for text in ("noise:3", "spikes:0.1"):
+        assert parse(text, settings).missingness == settings.missingness
     for text in ("mar:0.5", "outages:0.5:20", "reduction:0.5:random"):
         assert parse(text, settings).noise == settings.noise
     spiked = parse("spikes:0.1:7", settings).noise
@@ -110,41 +99,75 @@ def test_a_point_leaves_what_it_does_not_name_as_in_training(settings: Settings)
 
 @pytest.mark.parametrize(
     "text",
-    ["fog:0.5", "outages:0.5", "outages:0.5:20:leg", "reduction:0.5", "reduction:0.5:luck", "noise",
-     "noise:-1", "spikes:1.5", "spikes:0.1:inf", "mcar:0.5:3", "reduction:1.2:model"],
+    ["fog:0.5", "mcar", "mcar:x", "", "outages:0.5", "outages:0.5:20:leg", "reduction:0.5",
+     "reduction:0.5:luck", "noise", "noise:-1", "spikes:1.5", "spikes:0.1:inf", "mcar:0.5:3",
+     "reduction:1.2:model", "mcar:1.5"],
 )  # fmt: skip
-def test_a_point_that_can_not_be_read_is_refused(text: str, settings: Settings) -> None:
+def test_a_condition_that_can_not_be_read_is_refused(text: str, settings: Settings) -> None:
     with pytest.raises(UserError, match="`points` must hold trained or mechanism:eta") as error:
         parse(text, settings)
     assert repr(text) in str(error.value)
 
 
-def test_outages_that_no_chain_has_are_refused(settings: Settings) -> None:
+def test_the_default_conditions_are_those_of_the_paper_and_the_full_ones_go_beyond(
+    settings: Settings,
+) -> None:
+    levels = configured()["grid"]
+    usual = default_conditions(levels, full=False, model=True)
+    ratios = ("0.2", "0.4", "0.5", "0.6", "0.8")
+    families = ("mcar:{}", "mar:{}", "reduction:{}:model", "reduction:{}:random")
+    assert usual == ["none:0", *(f.format(ratio) for f in families for ratio in ratios)]
+    assert not any("model" in c for c in default_conditions(levels, full=True, model=False))
+    full = default_conditions(levels, full=True, model=True)
+    # A sensor that is off half of the time has outages of at least one step.
+    lengths, groups = (1, 2, 5, 10, 20, 50), ("sensor", "joint", "kind")
+    beyond = [f"nmar:{ratio}" for ratio in ratios]
+    beyond += [f"outages:0.5:{length}:{by}" for by in groups for length in lengths]
+    beyond += [f"noise:{sigma}" for sigma in (0, 1, 3, 10, 30)]
+    beyond += [f"spikes:{probability}" for probability in (0.01, 0.05, 0.1, 0.2)]
+    assert sorted(full) == sorted([*usual, *beyond])
+    for text in full:
+        parse(text, settings)
+
+
+def test_mean_lengths_that_no_chain_has_are_left_out_and_refused(settings: Settings) -> None:
+    levels = dict.fromkeys(configured()["grid"], ()) | {
+        "outage_ratios": [0.8], "outage_lengths": [1, 2, 4, 20], "outage_groups": ["sensor"],
+    }  # fmt: skip
+    texts = default_conditions(levels, full=True, model=False)
+    assert texts == ["outages:0.8:4:sensor", "outages:0.8:20:sensor"]
     with pytest.raises(UserError, match="`mean_length` must be at least eta"):
         parse("outages:0.8:2", settings)
 
 
-def test_each_family_changes_what_the_agent_gets(agent: TrainedAgent) -> None:
-    texts = ("outages:0.5:3:kind", "reduction:0.5:random", "reduction:0.5:model", "spikes:1:5")
-    points = [parse(text, agent.settings) for text in ("noise:0", *texts)]
-    found = [
-        result
-        for _, _, result in evaluate_points(agent, points, episodes=20, modes=["sampled"], seed=1)
-    ]
-    ratios = [result.missing_ratio for result in found]
-    assert ratios[0] == pytest.approx(0.2, abs=0.06)  # as in training
-    assert ratios[1] == pytest.approx(0.5, abs=0.15)
-    assert ratios[2] == ratios[3] == 0.5  # 2 of 4 sensors
-    assert ratios[4] == pytest.approx(0.2, abs=0.06)
-    clean, spiked = found[0].log_likelihood, found[4].log_likelihood
-    assert clean is not None
-    assert spiked is not None
-    assert spiked < clean  # a reading that is 5 off is not what the model expects
+def test_each_family_changes_what_the_agent_gets(drbpn: Path, tmp_path: Path) -> None:
+    texts = ("noise:0", "outages:0.5:3:kind", "reduction:0.5:random", "reduction:0.5:model")
+    points = ",".join(f"'{text}'" for text in (*texts, "spikes:1:5", "none:0", "mcar:1"))
+    rows = evaluate(
+        tmp_path / "out.csv", drbpn, points=points, episodes=20, modes=["sampled"]
+    )  # fmt: skip
+    frame = {row["point"]: [r for r in rows if r["point"] == row["point"]] for row in rows}
+
+    def mean(point: str, column: str) -> float:
+        steps = [int(row["length"]) for row in frame[point]]
+        return float(np.average([float(row[column]) for row in frame[point]], weights=steps))
+
+    assert mean("noise:0", "missing_ratio") == pytest.approx(0.2, abs=0.06)  # as in training
+    assert mean("spikes:1:5", "missing_ratio") == pytest.approx(0.2, abs=0.06)
+    assert mean("outages:0.5:3:kind", "missing_ratio") == pytest.approx(0.5, abs=0.15)
+    for by in ("random", "model"):  # 2 of 4 sensors
+        assert mean(f"reduction:0.5:{by}", "missing_ratio") == pytest.approx(0.5)
+    assert (mean("none:0", "missing_ratio"), mean("mcar:1", "missing_ratio")) == (0.0, 1.0)
+    # A reading that is 5 off is not what the model expects.
+    assert mean("spikes:1:5", "log_likelihood") < mean("noise:0", "log_likelihood")
+
+
+# Sensors that are removed ---------------------------------------------------------------------
 
 
 def removed_at_random(ratio: float, trained: TrainedAgent, episodes: int, seed: int = 0) -> Any:
-    point = parse(f"reduction:{ratio}:random", trained.settings)
-    return removed_sensors(point, trained, episodes=episodes, reduction_seed=seed)
+    condition = parse(f"reduction:{ratio}:random", trained.settings)
+    return removed_sensors(condition, trained, episodes=episodes, reduction_seed=seed)
 
 
 def test_random_reduction_is_the_same_for_every_agent_and_nested(
@@ -158,10 +181,9 @@ def test_random_reduction_is_the_same_for_every_agent_and_nested(
         assert removed.sum(-1).tolist() == [count] * 30
         assert (removed | ~smaller).all()
         smaller = removed
+    by_model = parse("reduction:0.5:model", other.settings)
     with pytest.raises(UserError, match="has learned no H, P and R"):
-        removed_sensors(
-            parse("reduction:0.5:model", other.settings), other, episodes=1, reduction_seed=0
-        )
+        removed_sensors(by_model, other, episodes=1, reduction_seed=0)
 
 
 def test_each_episode_lacks_sensors_of_its_own_by_its_number_alone(agent: TrainedAgent) -> None:
@@ -171,13 +193,11 @@ def test_each_episode_lacks_sensors_of_its_own_by_its_number_alone(agent: Traine
     assert len({tuple(row) for row in many.tolist()}) == 6  # all pairs of four
     # Every sensor is removed in half of the episodes; five standard deviations of 400 draws.
     assert (many.double().mean(0) - 0.5).abs().max() < 5 * 0.5 / 400**0.5
-    chosen = removed_sensors(
-        parse("reduction:0.5:model", agent.settings), agent, episodes=3, reduction_seed=0
-    )
+    by_model = parse("reduction:0.5:model", agent.settings)
+    chosen = removed_sensors(by_model, agent, episodes=3, reduction_seed=0)
     assert chosen is not None
     assert (chosen == chosen[0]).all()
-    kept = (~chosen[0]).nonzero().squeeze(-1).tolist()
-    assert sorted(kept_sensors(agent, 2)) == kept
+    assert sorted(kept_sensors(agent, 2)) == (~chosen[0]).nonzero().squeeze(-1).tolist()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -193,46 +213,68 @@ def test_random_reduction_does_not_draw_what_training_never_lost(
     assert abs(both / episodes - 0.25) < 5 * (0.25 * 0.75 / episodes) ** 0.5
 
 
+# Episodes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("belief", ["drbpn", "dvrl"])
+def test_more_episodes_only_add(
+    belief: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Starts, gaps, noise, spikes, outages, actions and particles, across blocks of simulators."""
+    monkeypatch.setattr(episodes_room, "BLOCK", 3)
+    monkeypatch.setattr("evaluation.trained.BLOCK", 3)
+    folder = trained_folder(tmp_path / belief, f"belief={belief}")
+    points = "'mar:0.5','outages:0.5:3','spikes:0.2','reduction:0.5:random'"
+    how: dict[str, Any] = {"points": points, "modes": ["sampled"]}
+    many = evaluate(tmp_path / "many.csv", folder, episodes=7, **how)
+    for count in (2, 4):
+        few = evaluate(tmp_path / f"{count}.csv", folder, episodes=count, **how)
+        assert few == [row for row in many if int(row["episode"]) < count]
+    returns = [float(row["log_likelihood"] or row["return"]) for row in many]
+    assert len(set(returns)) > len(returns) / 2  # no episode is another one again
+
+
+def test_an_episode_sees_the_same_to_the_bit_among_more(agent: TrainedAgent) -> None:
+    condition = parse("mcar:0.5", agent.settings)
+    seen: dict[int, list[torch.Tensor]] = {}
+    for episodes in (1, 4):
+        rows = seen[episodes] = []
+
+        def watch(_: slice, data: Any, running: torch.Tensor, rows: list[Any] = rows) -> None:
+            if running[0]:
+                keys = ("observation", "observed", "action", ("next", "reward"), "features")
+                rows.append(torch.cat([data[key][0].double() for key in keys]))
+
+        done = run_episodes(
+            agent.agent.policy,
+            agent.environments(condition.missingness),
+            episodes=episodes,
+            mode="sampled",
+            seed=5,
+            watch=watch,
+        )
+        assert done
+    assert len(seen[1]) == len(seen[4]) > 1
+    assert torch.equal(torch.stack(seen[1]), torch.stack(seen[4]))
+
+
+def test_the_global_generator_is_left_alone_and_stopping_gives_nothing(agent: TrainedAgent) -> None:
+    before = torch.get_rng_state()
+    how = {"episodes": 2, "mode": "mean", "seed": 5}
+    policy = StoppingPolicy(agent.agent)
+    result = episodes_room.evaluate(policy, agent.environments(), **how)
+    assert result is not None
+    assert len(result.returns) == 2
+    assert episodes_room.evaluate(policy, agent.environments(), **how, stop=lambda: True) is None
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_a_small_share_of_one_entry_weighs_as_what_it_is() -> None:
     """In two episodes one entry of 100 arrived in all: its likelihood is that of the evaluation."""
     few = Episodes([0.0, 0.0], [10, 10], [0.99, 1.0], [-2.5, 0.0], [False, False])
     assert few.log_likelihood == pytest.approx(-2.5)
     assert Episodes([0.0], [10], [1.0], [0.0], [False]).log_likelihood == 0.0
-
-
-# The grid -------------------------------------------------------------------------------------
-
-
-def test_the_default_grid_is_that_of_the_paper_and_the_full_one_goes_beyond(
-    settings: Settings,
-) -> None:
-    grid = Grid(**configured()["grid"])
-    points = grid_points(grid, full=False, model=True)
-    ratios = ("0.2", "0.4", "0.5", "0.6", "0.8")
-    families = ("mcar:{}", "mar:{}", "reduction:{}:model", "reduction:{}:random")
-    assert points == ["none:0", *(f.format(ratio) for f in families for ratio in ratios)]
-    assert not any("model" in p for p in grid_points(grid, full=True, model=False))
-    everything = grid_points(grid, full=True, model=True)
-    beyond = [f"nmar:{ratio}" for ratio in ratios]
-    # A sensor that is off half of the time has outages of at least one step.
-    lengths, groups = (1, 2, 5, 10, 20, 50), ("sensor", "joint", "kind")
-    beyond += [f"outages:0.5:{length}:{by}" for by in groups for length in lengths]
-    beyond += [f"noise:{sigma}" for sigma in (0, 1, 3, 10, 30)]
-    beyond += [f"spikes:{probability}" for probability in (0.01, 0.05, 0.1, 0.2)]
-    assert sorted(everything) == sorted([*points, *beyond])
-    assert len(points) == 21
-    assert len(everything) == 53
-    assert configured()["modes"] == ["sampled", "mean"]
-    for point in everything:
-        parse(point, settings)
-
-
-def test_mean_lengths_that_no_chain_has_are_left_out_of_the_grid(settings: Settings) -> None:
-    grid = Grid([], [0.8], [1, 2, 4, 20], ["sensor"], [], [])
-    points = grid_points(grid, full=True, model=False)
-    assert points == ["outages:0.8:4:sensor", "outages:0.8:20:sensor"]
-    for point in points:
-        parse(point, settings)
+    assert Episodes([0.0], [10], [0.0], [1.0], [True]).log_likelihood is None
 
 
 # The table ------------------------------------------------------------------------------------
@@ -250,9 +292,7 @@ def test_one_row_an_episode_and_a_baseline_only_at_random(
     assert "none: sensors are removed at random only" in capsys.readouterr().out
     assert len(rows) == 9 * 2 * 2
     assert {row["seed"] for row in rows} == {"10000"}
-    mcar = [row for row in rows if row["point"] == "mcar:0.5"]
-    assert {row["eta"] for row in mcar} == {"0.5"}
-    assert 0.3 < np.mean([float(row["missing_ratio"]) for row in mcar]) < 0.7
+    assert {row["eta"] for row in rows if row["point"] == "mcar:0.5"} == {"0.5"}
 
 
 def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(
@@ -261,57 +301,68 @@ def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(
     points = "none:0,'mcar:0.5','outages:0.5:4'"
     whole, broken = tmp_path / "whole.csv", tmp_path / "broken.csv"
     evaluate(whole, drbpn, points=points)
-    real, calls = evaluation_grid.evaluate_point, []
+    real, calls = table_room.evaluate_condition, []
 
-    def dies(*args: Any) -> Any:
+    def dies(*args: Any, **options: Any) -> Any:
         calls.append(args)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return real(*args)
+        return real(*args, **options)
 
-    monkeypatch.setattr(evaluation_grid, "evaluate_point", dies)
+    monkeypatch.setattr(table_room, "evaluate_condition", dies)
     with pytest.raises(KeyboardInterrupt):
         evaluate(broken, drbpn, points=points)
-    with broken.open(newline="") as file:
-        assert {row["point"] for row in csv.DictReader(file)} == {"none:0"}
+    assert {row["point"] for row in read_rows(broken)} == {"none:0"}
     evaluate(broken, drbpn, points=points)
-    assert len(calls) == 2 + 2  # the finished point was not made again
+    assert len(calls) == 2 + 2  # the finished condition was not evaluated again
     assert broken.read_bytes() == whole.read_bytes()
     assert not list(tmp_path.glob(".*"))
 
 
 def test_the_order_of_the_table_is_that_of_the_points_and_others_are_kept(
-    drbpn: Path, tmp_path: Path
+    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out.csv"
     evaluate(out, drbpn, points="'mcar:0.5'")
-    evaluate(out, drbpn, points="'mar:0.5'")
+    evaluate(out, drbpn, points="'mar:0.5'", modes=["mean"])
     rows = evaluate(out, drbpn, points="none:0,'mar:0.5'")
     assert list(dict.fromkeys(row["point"] for row in rows)) == ["mcar:0.5", "none:0", "mar:0.5"]
+    assert [row["mode"] for row in rows] == ["sampled", "sampled", "mean", "mean"] * 3
+    before = out.read_bytes()
+    capsys.readouterr()
+    evaluate(out, drbpn, points="none:0,'mar:0.5'", modes=["mean"])
+    assert "2 of 2 points are in" in capsys.readouterr().out
+    assert out.read_bytes() == before
 
 
-def test_two_processes_give_the_numbers_of_one(
-    drbpn: Path, tmp_path: Path, settings: Settings
-) -> None:
-    one = evaluate(tmp_path / "one.csv", drbpn, points="none:0,'mcar:0.5'")
-    two = evaluate(tmp_path / "two.csv", drbpn, points="none:0,'mcar:0.5'", processes=2)
+def test_two_processes_give_the_numbers_of_one(drbpn: Path, tmp_path: Path) -> None:
+    one = evaluate(tmp_path / "one.csv", drbpn, points="none:0,'mcar:0.5'", gate=2)
+    two = evaluate(tmp_path / "two.csv", drbpn, points="none:0,'mcar:0.5'", gate=2, processes=2)
     assert one == two
     assert list(evaluate_tasks([], None, 2)) == []  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("change", "what"),
-    [({"episodes": 3}, "with episodes 2, and 3"), ({"seed": 5}, "with seed 10000, and 5")],
+    [
+        ({"episodes": 3}, "with episodes 2, and 3"),
+        ({"seed": 5}, "with seed 10000, and 5"),
+        ({"reduction_seed": 3}, "with reduction_seed 0, and 3"),
+        ({"gate": 1}, "with method drbpn, and drbpn, gate 1"),
+    ],
 )
 def test_a_table_of_other_settings_is_not_mixed_with(
     drbpn: Path, tmp_path: Path, change: dict[str, int], what: str
 ) -> None:
-    out = tmp_path / "out.csv"
-    evaluate(out, drbpn, points="none:0")
-    with pytest.raises(UserError, match=what):
-        evaluate(out, drbpn, points="none:0", **change)
-    rows = evaluate(out, drbpn, points="none:0", overwrite=True, **change)
-    assert len(rows) == 2 * change.get("episodes", 2)
+    out, points = tmp_path / "out.csv", "'reduction:0.5:random',none:0"
+    rows = evaluate(out, drbpn, points=points)
+    assert [row["reduction_seed"] for row in rows] == ["0"] * 4 + [""] * 4
+    before = out.read_bytes()
+    with pytest.raises(UserError, match=f"{what} is asked for"):
+        evaluate(out, drbpn, points=points, **change)
+    assert out.read_bytes() == before
+    rows = evaluate(out, drbpn, points=points, overwrite=True, **change)
+    assert len(rows) == 4 * change.get("episodes", 2)
 
 
 def test_another_study_of_the_same_folder_names_is_not_taken_for_it(
@@ -332,33 +383,60 @@ def test_another_study_of_the_same_folder_names_is_not_taken_for_it(
     with pytest.raises(UserError, match="with method drbpn, and ppo_ours is asked for"):
         evaluate(out, second, points="none:0")
     assert out.read_bytes() == before
+    with pytest.raises(UserError, match="different names, hopper-s0 comes twice"):
+        evaluate(out, first, second, points="none:0")
 
 
-def test_another_choice_of_random_sensors_is_not_mixed_with(drbpn: Path, tmp_path: Path) -> None:
-    out, points = tmp_path / "out.csv", "'reduction:0.5:random'"
-    rows = evaluate(out, drbpn, points=points + ",none:0")
-    assert {(row["point"], row["reduction_seed"]) for row in rows} == {
-        ("reduction:0.5:random", "0"),
-        ("none:0", ""),
-    }
-    with pytest.raises(UserError, match="with reduction_seed 0, and 3 is asked for"):
-        evaluate(out, drbpn, points=points, reduction_seed=3)
-    with pytest.raises(UserError, match="`reduction_seed` must be a whole number of at least 0"):
-        evaluate(out, drbpn, points=points, reduction_seed=-1)
+@pytest.mark.parametrize("text", ["frames,mechanism\n1,mcar\n", "\x00\x01", ""])
+def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path, text: str) -> None:
+    out = tmp_path / "out.csv"
+    out.write_text(text)
+    with pytest.raises(UserError, match=r"no table of this command|can't be read as a table"):
+        evaluate(out, drbpn, points="none:0")
+    assert out.read_text() == text
 
 
-def test_one_kind_of_action_after_the_other_gives_the_table_of_both(
-    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+# Folders --------------------------------------------------------------------------------------
+
+NAMES = ["a=b", "a,b", "[ab]", "a b", "it's", 'a"b', "a*", "$HOME", "eta={0.5}", "back\\slash"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_folder_is_found_whatever_its_name_holds(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / name
+    folder.mkdir()
+    (tmp_path / "a").mkdir()
+    assert find_folders(str(folder)) == [folder]
+    # What is printed for a shell comes back from shell and Hydra as it was.
+    (word,) = shlex.split(override("run", folder))
+    assert configured("evaluate", word)["run"] == str(folder)
+
+
+def test_the_command_line_takes_what_it_prints(drbpn: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "eta=0.5, [s 0]"
+    shutil.copytree(drbpn, folder)
+    words = [override("run", folder), "points=[none:0]", "episodes=1", "figures=false"]
+    command = f"{sys.executable} {ROOT}/recipes/evaluate.py {' '.join(words[:1])}"
+    done = subprocess.run(
+        ["bash", "-c", f"{command} {shlex.join(words[1:])} processes=1"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert (folder / "points.csv").is_file()
+
+
+def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(
+    drbpn: Path, feedforward: Path, tmp_path: Path
 ) -> None:
-    both, apart = tmp_path / "both.csv", tmp_path / "apart.csv"
-    evaluate(both, drbpn, points="none:0,'mcar:0.5'")
-    evaluate(apart, drbpn, points="none:0,'mcar:0.5'", modes=["mean"])
-    evaluate(apart, drbpn, points="none:0,'mcar:0.5'", modes=["sampled"])
-    assert apart.read_bytes() == both.read_bytes()
-    capsys.readouterr()
-    evaluate(apart, drbpn, points="none:0,'mcar:0.5'", modes=["mean"])
-    assert "2 of 2 points are in" in capsys.readouterr().out
-    assert apart.read_bytes() == both.read_bytes()
+    for folder in (drbpn, feedforward):
+        shutil.copytree(folder, tmp_path / folder.name)
+    (tmp_path / "empty").mkdir()
+    both = [tmp_path / "drbpn", tmp_path / "none"]
+    assert find_folders(str(tmp_path / "*")) == both
+    assert find_folders([str(both[0]), str(tmp_path / "*")]) == both
+    for wanted in (str(tmp_path / "x*"), str(tmp_path / "x"), [], None):
+        with pytest.raises(UserError, match="`run` must name run folders"):
+            find_folders(wanted)
 
 
 def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(
@@ -374,123 +452,67 @@ def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(
         evaluate(tmp_path / "out.csv", young, points="none:0")
 
 
-def test_the_full_grid_of_a_task_without_sensor_names_has_no_groups(
+# Settings -------------------------------------------------------------------------------------
+
+
+def test_the_full_list_of_a_task_without_sensor_names_has_no_groups(
     agent: TrainedAgent, capsys: pytest.CaptureFixture[str]
 ) -> None:
     env = dataclasses.replace(agent.settings.env, id="Homemade")
     unnamed = dataclasses.replace(agent, settings=dataclasses.replace(agent.settings, env=env))
-    names = {point.name for point in recipe._points(configured("full=true"), "run", unnamed)}
+    full = configured("evaluate", "full=true")
+    names = {c.name for c in recipe._conditions(full, Path("run"), unnamed)}
     assert "outages:0.5:20:sensor" in names
     assert not any(name.endswith((":joint", ":kind")) for name in names)
-    assert "run: outages of single sensors only; those of Homemade-v5" in capsys.readouterr().out
-    with_names = {point.name for point in recipe._points(configured("full=true"), "run", agent)}
+    assert "run: outages of single sensors only" in capsys.readouterr().out
+    with_names = {c.name for c in recipe._conditions(full, Path("run"), agent)}
     assert "outages:0.5:20:joint" in with_names
-
-
-def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.csv"
-    out.write_text("frames,mechanism\n1,mcar\n")
-    with pytest.raises(UserError, match="no table of this command, or of an earlier one"):
-        evaluate(out, drbpn, points="none:0")
-    assert out.read_text() == "frames,mechanism\n1,mcar\n"
 
 
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"run": None}, "`run` must name a run folder"),
-        ({"run": "no/such/run"}, "there is no folder no/such/run"),
+        ({"run": None}, "`run` must name run folders"),
         ({"episodes": 0}, "`episodes` must be a whole number of at least 1"),
         ({"processes": 0}, "`processes` must be a whole number"),
         ({"modes": ["best"]}, "`modes` must hold sampled and mean"),
         ({"modes": []}, "`modes` must hold sampled, mean or both"),
         ({"output": "no/such/folder/x.csv"}, "`output` must lie in an existing folder"),
+        ({"points": "'reduction:0.5:random'", "reduction_seed": -1}, "`reduction_seed` must be"),
+        ({"gate": 0}, "`gate` must be a positive, finite number"),
+        ({"gate": "wide"}, "`gate` must be a positive, finite number"),
     ],
 )
 def test_bad_settings_are_one_line(
     drbpn: Path, tmp_path: Path, options: dict[str, Any], what: str
 ) -> None:
-    with pytest.raises(UserError, match=what):
-        evaluate(tmp_path / "out.csv", drbpn, points="none:0", **options)
+    with pytest.raises(UserError, match=what) as caught:
+        evaluate(tmp_path / "out.csv", drbpn, **({"points": "none:0"} | options))
+    assert "\n" not in str(caught.value)
 
 
-# A gate ---------------------------------------------------------------------------------------
-
-
-def test_a_gate_changes_what_spikes_do_and_tells_in_the_table(drbpn: Path, tmp_path: Path) -> None:
-    out, points = tmp_path / "out.csv", "'spikes:1:50'"
-    believed = evaluate(out, drbpn, points=points)
+def test_a_gate_changes_what_spikes_do_and_tells_in_the_table(
+    drbpn: Path, feedforward: Path, tmp_path: Path
+) -> None:
+    points = "'spikes:1:50'"
+    believed = evaluate(tmp_path / "out.csv", drbpn, points=points)
     bounded = evaluate(tmp_path / "bounded.csv", drbpn, points=points, gate=1)
     assert {row["method"] for row in believed} == {"drbpn"}
     assert {row["method"] for row in bounded} == {"drbpn, gate 1"}
     assert [r["log_likelihood"] for r in believed] != [r["log_likelihood"] for r in bounded]
-    two = evaluate(tmp_path / "two.csv", drbpn, points=points + ",none:0", gate=1, processes=2)
-    assert [row for row in two if row["point"] != "none:0"] == bounded
-    with pytest.raises(UserError, match="with method drbpn, and drbpn, gate 1 is asked for"):
-        evaluate(out, drbpn, points=points, gate=1)
+    with pytest.raises(UserError, match="`gate` must be null for belief=none, got 3"):
+        evaluate(tmp_path / "none.csv", feedforward, points="none:0", gate=3)
 
 
 def test_tables_with_a_gate_have_a_name_of_their_own(drbpn: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(drbpn, folder)
-    base = configured("points=[none:0]", "gate=2.5") | {"run": str(folder), "figures": False}
-    assert recipe.run(base | {"processes": 1, "episodes": 2}) == 0
+    base = configured("evaluate", "points=[none:0]", "gate=2.5") | {"run": str(folder)}
+    assert recipe.run(base | {"processes": 1, "episodes": 2, "figures": False}) == 0
     assert (folder / "points-gate2.5.csv").is_file()
     assert not (folder / "points.csv").exists()
     with pytest.raises(UserError, match=r"`output` must not be called points\.csv with a gate"):
         recipe.run(base | {"output": str(folder / "points.csv")})
-
-
-@pytest.mark.parametrize("gate", [0, "wide", True])
-def test_a_gate_that_is_no_positive_number_is_one_line(
-    drbpn: Path, tmp_path: Path, gate: Any
-) -> None:
-    with pytest.raises(UserError, match="`gate` must be a positive, finite number"):
-        evaluate(tmp_path / "out.csv", drbpn, points="none:0", gate=gate)
-
-
-def test_a_belief_without_a_forecast_has_no_gate(feedforward: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="`gate` must be null for belief=none, got 3"):
-        evaluate(tmp_path / "out.csv", feedforward, points="none:0", gate=3)
-
-
-# Sensors that fail together -------------------------------------------------------------------
-
-
-def test_groups_hold_every_component_once_in_every_named_task() -> None:
-    sizes = {("Reacher", "v4"): 11, ("Reacher", "v5"): 10}
-    for task, version in named_tasks():
-        grouped = 0
-        for obs_dim in [sizes[task, version]] if (task, version) in sizes else range(4, 400):
-            try:
-                names = sensor_names(task, version, obs_dim)
-            except UserError:
-                continue  # no size of this task; some size is
-            grouped += 1
-            for by in ("joint", "kind"):
-                groups = sensor_groups(names, by)
-                assert groups is not None
-                assert sorted(i for group in groups for i in group) == list(range(obs_dim))
-                assert 1 < len(groups) < obs_dim, (task, by)
-        assert grouped, (task, version)
-
-
-def test_a_joint_is_its_angle_and_its_velocity_and_a_kind_all_positions() -> None:
-    names = sensor_names("Hopper", "v5", 11)
-    assert sensor_groups(names, "sensor") is None
-    joints = sensor_groups(names, "joint")
-    assert joints == [[0, 1, 5, 6, 7], [2, 8], [3, 9], [4, 10]]
-    assert sensor_groups(names, "kind") == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9, 10]]
-
-
-def test_groups_need_names() -> None:
-    with pytest.raises(UserError, match="goes by the names of the sensors"):
-        sensor_groups(["component 0", "component 1"], "joint")
-    with pytest.raises(UserError, match="`group_by` must be sensor, joint or kind"):
-        sensor_groups(["pole angle"], "leg")
-
-
-# Figures --------------------------------------------------------------------------------------
 
 
 def test_a_figure_has_a_panel_a_family_and_kind_of_action(drbpn: Path, tmp_path: Path) -> None:

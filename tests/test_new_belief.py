@@ -36,7 +36,7 @@ def command_of_the_page() -> tuple[dict[str, str], list[str]]:
 
 
 def test_the_command_of_the_page_trains_it_from_anywhere(tmp_path: Path) -> None:
-    from evaluation.episodes import evaluate, make_evaluation_environment
+    from evaluation.episodes import evaluate
     from evaluation.trained import load_trained_agent
 
     extra, words = command_of_the_page()
@@ -54,8 +54,8 @@ def test_the_command_of_the_page_trains_it_from_anywhere(tmp_path: Path) -> None
     assert 0.6 < float(row["decay"]) < 0.8
     trained = load_trained_agent(tmp_path / "run")
     assert trained.settings.belief["name"] == "moving_average"
-    env = make_evaluation_environment(trained.settings, trained.belief, trained.agent, episodes=2)
-    policy, statistics = trained.agent.policy, trained.statistics
-    result = evaluate(policy, env, mode="sampled", seed=0, statistics=statistics)
+    result = evaluate(
+        trained.agent.policy, trained.environments(), episodes=2, mode="sampled", seed=0
+    )
     assert result is not None
     assert min(result.lengths) > 0

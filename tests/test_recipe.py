@@ -26,7 +26,6 @@ import torch
 pytest.importorskip("hydra")
 from recipe_tools import ROOT, differences, make_config, read_table  # isort: skip
 
-from evaluation.conditions import episode_rows, evaluate_points, parse_point, read_point
 from evaluation.episodes import evaluate, make_evaluation_environment
 from evaluation.trained import load_trained_agent
 from training import run_folder
@@ -121,11 +120,17 @@ def test_evaluation_leaves_the_global_generator_and_the_statistics_alone() -> No
     training = assemble(settings)
     train_rollout(training, settings)
     before = _copy(training_state(training))
-    env = make_evaluation_environment(settings, training.belief, training.agent, episodes=3)
-    result = evaluate(training.agent.policy, env, mode="sampled", seed=5, statistics=training.env)
+
+    def make_env(_: int) -> Any:
+        return make_evaluation_environment(
+            settings, training.belief, training.agent, statistics=training.env
+        )
+
+    policy, how = training.agent.policy, {"episodes": 3, "seed": 5}
+    result = evaluate(policy, make_env, mode="sampled", **how)
     assert result is not None
     assert len(result.returns) == len(result.lengths) == 3
-    assert evaluate(training.agent.policy, env, mode="mean", seed=5, stop=lambda: True) is None
+    assert evaluate(policy, make_env, mode="mean", **how, stop=lambda: True) is None
     assert differences(before, _copy(training_state(training))) == []
 
 
@@ -292,41 +297,18 @@ def test_a_table_drops_what_was_written_after_the_checkpoint(tmp_path: Path) -> 
 def test_the_agent_read_back_repeats_the_final_evaluation(smoke: Path) -> None:
     trained = load_trained_agent(smoke)
     final = [row for row in read_table(smoke / "evaluation.csv") if row["kind"] == "final"]
-    found = evaluate_points(
-        trained,
-        [parse_point("trained", trained.settings, spike_std=1.0)],
-        episodes=3,
-        modes=["sampled", "mean"],
-        seed=trained.settings.evaluation.seed,
-    )
-    for row, (_, mode, result) in zip(final, found, strict=True):
-        assert mode == row["mode"]
+    for row in final:
+        result = evaluate(
+            trained.agent.policy,
+            trained.environments(),
+            episodes=3,
+            mode=row["mode"],
+            seed=trained.settings.evaluation.seed,
+        )
+        assert result is not None
         assert result.mean_return == float(row["return_mean"])
         assert result.missing_ratio == pytest.approx(float(row["missing_ratio"]))
         assert result.log_likelihood == pytest.approx(float(row["log_likelihood"]))
-
-
-def test_a_point_changes_what_is_missing_and_nothing_else(smoke: Path) -> None:
-    trained = load_trained_agent(smoke)
-    points = [
-        parse_point(text, trained.settings, spike_std=1.0)
-        for text in ("none:0", "mcar:1", "mcar:0.5")
-    ]
-    ratios = []
-    for point, mode, result in evaluate_points(trained, points, episodes=4, modes=["mean"], seed=3):
-        ratios.append(result.missing_ratio)
-        rows = episode_rows(trained, point, mode, result)
-        assert [row["episode"] for row in rows] == [0, 1, 2, 3]
-        assert rows[0]["mechanism_seed"] == trained.settings.missingness.mechanism_seed
-    assert ratios[:2] == [0.0, 1.0]
-    assert 0.3 < ratios[2] < 0.7
-
-
-@pytest.mark.parametrize("text", ["fog:0.5", "mcar:1.5", "mcar", "mcar:x", ""])
-def test_a_point_that_can_not_be_read_is_refused(smoke: Path, text: str) -> None:
-    trained = read_settings(read_config(smoke)).missingness
-    with pytest.raises(UserError, match="`points` must hold trained or mechanism:eta"):
-        read_point(text, trained)
 
 
 # The command line ------------------------------------------------------------------------------

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from statistics import NormalDist
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
+from scipy import stats
 from torch import Tensor
 
-from analysis.calibration import ARRIVED, COVERAGE, LEVELS, Tally
-from torchrl_drbpn.functional import chi_square_quantile
-
-ALL = "all"
-_INTERVAL = (0.025, 0.975)
-
-
-def _same(ratio: Tensor) -> Tensor:
-    return ratio
+from analysis.calibration import ALL, ARRIVED, COVERAGE, LEVELS, MISSING, Forecast, Sums, Tally
 
 
 class Resampling:
-    r"""Draw episodes with replacement, to say how far a number would be off with others.
+    r"""Draw episodes with replacement, to tell how far a number would be off with others.
 
-    Entries of one episode hang together, those of two do not: whole episodes are drawn (the
+    Entries of one episode are correlated, those of two are not: whole episodes are drawn (the
     bootstrap over clusters), and a number is a ratio of sums over the drawn ones. Of few episodes
     the 95 % percentiles are too narrow (91 % of ten); the interval takes those that a Student
     interval of a mean would reach: :math:`\Phi(\mp t_{n-1} \sqrt{n / (n - 1)})`, the expanded
@@ -39,21 +31,17 @@ class Resampling:
     def __init__(self, episodes: int, resamples: int, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.randint(episodes, (resamples, episodes), generator=generator)
-        self.weights = torch.zeros(resamples, episodes, dtype=torch.float64)
-        self.weights.scatter_add_(1, drawn, torch.ones(drawn.shape, dtype=torch.float64))
+        self.weights = torch.nn.functional.one_hot(drawn, episodes).sum(1).double()
 
     def ratio(
-        self,
-        numerator: Tensor,
-        denominator: Tensor,
-        then: Callable[[Tensor], Tensor] = lambda ratio: ratio,
+        self, numerator: Tensor, denominator: Tensor, then: Callable[[Any], Any] = float
     ) -> tuple[float | None, float | None, float | None]:
         """Return a ratio of sums and its 95 % interval.
 
         Args:
             numerator: sums of each episode, shape ``(episodes,)``.
             denominator: the same shape.
-            then: monotonous, applied to the ratio.
+            then: monotonous, applied to the ratio and its ends.
 
         Returns:
             The number, None where there is nothing to divide by, and the ends of its interval,
@@ -61,34 +49,22 @@ class Resampling:
         """
         if not denominator.sum() > 0:
             return None, None, None
-        value = then(numerator.sum() / denominator.sum()).item()
-        if (denominator > 0).sum() < 2:
+        value = then((numerator.sum() / denominator.sum()).item())
+        count = int((denominator > 0).sum())
+        if count < 2:
             return value, None, None
-        ratios = then((self.weights @ numerator) / (self.weights @ denominator))
-        low, high = torch.nanquantile(ratios, _levels(int((denominator > 0).sum()))).tolist()
-        return value, low, high
-
-
-def _levels(count: int) -> Tensor:
-    """Return the percentiles whose interval holds a mean of `count` episodes in 95 of 100 cases."""
-    normal, free = NormalDist(), count - 1
-    z = normal.inv_cdf(_INTERVAL[1])
-    # Student's quantile by its expansion in 1 / free, 26.7.5 of Abramowitz and Stegun.
-    student = (
-        z
-        + (z**3 + z) / (4 * free)
-        + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * free**2)
-        + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * free**3)
-    )
-    tail = normal.cdf(-student * math.sqrt(count / free))
-    return torch.tensor([tail, 1 - tail], dtype=torch.float64)
+        student = stats.t.ppf(0.975, count - 1) * math.sqrt(count / (count - 1))
+        levels = torch.tensor(stats.norm.cdf([-student, student]))
+        ratios = (self.weights @ numerator) / (self.weights @ denominator)
+        low, high = torch.nanquantile(ratios, levels).tolist()
+        return value, then(low), then(high)
 
 
 def precision_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[dict[str, Any]]:
     """Make the rows of precision.csv: how far estimates are from the noiseless truth.
 
     Args:
-        tally: of an agent at a point.
+        tally: of an agent under a condition.
         resamples: for the intervals.
         seed: of them.
 
@@ -96,114 +72,88 @@ def precision_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[dict[
         Columns and values. Steps since last seen are 0 for entries that arrived.
     """
     resampling = Resampling(len(tally.lengths), resamples, seed)
-    for (estimate, entries), sums in tally.precision.items():
-        for name, index in _classes(tally, sums):
-            if entries == ARRIVED and name != ALL:
-                continue
-            squared, count = _taken(sums["squared"], index), _taken(sums["count"], index)
-            rmse = resampling.ratio(squared, count, Tensor.sqrt)
-            yield {
-                "estimate": estimate,
-                "entries": entries,
-                "steps_since_seen": "0" if entries == ARRIVED else name,
-                "count": int(count.sum()),
-                "rmse": rmse[0],
-                "rmse_low": rmse[1],
-                "rmse_high": rmse[2],
-            }
+    for (estimate, entries), sums in tally.errors.items():
+        for name, own in _classes(tally, sums):
+            if entries == MISSING or name == ALL:
+                yield {
+                    "estimate": estimate,
+                    "entries": entries,
+                    "steps_since_seen": "0" if entries == ARRIVED else name,
+                    "count": int(own["count"].sum()),
+                } | _interval("rmse", resampling.ratio(own["squared"], own["count"], math.sqrt))
 
 
 def calibration_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Make the rows of calibration.csv: how honest the claimed deviations are.
+    """Make the rows of calibration.csv: whether claimed deviations are right.
 
     Args:
-        tally: of an agent at a point.
+        tally: of an agent under a condition.
         resamples: for the intervals.
         seed: of them.
 
     Yields:
-        Columns and values.
+        Columns and values. ``consistent_low`` and ``consistent_high`` are the band in which NIS
+        over entries of a right belief lies in 95 of 100 cases.
     """
     resampling = Resampling(len(tally.lengths), resamples, seed)
-    for forecast, sums in tally.honesty.items():
-        for name, index in _classes(tally, sums):
-            count = _taken(sums["count"], index)
-            row: dict[str, Any] = {
-                "estimate": forecast.estimate,
-                "sensor_noise": "in" if forecast.noise else "out",
-                "held_against": forecast.target,
-                "entries": forecast.entries,
+    for forecast, sums in tally.forecasts.items():
+        for name, own in _classes(tally, sums):
+            count = own["count"]
+            total = count.sum().item()
+            nis = own.get("nis_joint" if name == ALL else "nis")
+            band = (None, None) if nis is None else stats.chi2.ppf([0.025, 0.975], total) / total
+            row = {
+                **_columns(forecast),
                 "steps_since_seen": name,
-                "count": int(count.sum()),
-                "rmse": math.sqrt((_taken(sums["squared"], index).sum() / count.sum()).item()),
-                "claimed_std": math.sqrt(
-                    (_taken(sums["variance"], index).sum() / count.sum()).item()
-                ),
+                "count": int(total),
+                "rmse": math.sqrt(own["squared"].sum() / total),
+                "claimed_std": math.sqrt(own["variance"].sum() / total),
             }
             for level in COVERAGE:
-                inside = _taken(sums[f"inside_{level:g}"], index)
-                _put(row, f"coverage_{100 * level:g}", resampling.ratio(inside, count))
-            _put(row, "crps", resampling.ratio(_taken(sums["crps"], index), count))
-            score = _taken(sums["log_score"], index).sum() / count.sum()
-            row["log_score"] = score.item()
-            row |= _nis(sums, index, count, resampling)
-            yield row
-
-
-def _nis(
-    sums: Mapping[str, Tensor], index: int | None, count: Tensor, resampling: Resampling
-) -> dict[str, Any]:
-    """Return NIS over degrees of freedom and the band of a consistent filter."""
-    row: dict[str, Any] = {}
-    if "nis" not in sums:
-        _put(row, "nis_per_dof", (None, None, None))
-        return row | {"consistent_low": None, "consistent_high": None}
-    nis = sums["nis_joint"].squeeze(-1) if index is None else sums["nis"][:, index]
-    _put(row, "nis_per_dof", resampling.ratio(nis, count))
-    dof = count.sum()
-    band = chi_square_quantile(torch.tensor(_INTERVAL, dtype=torch.float64), dof) / dof
-    return row | {"consistent_low": band[0].item(), "consistent_high": band[1].item()}
+                inside = resampling.ratio(own[f"inside_{level:g}"], count)
+                row |= _interval(f"coverage_{100 * level:g}", inside)
+            row |= _interval("crps", resampling.ratio(own["crps"], count))
+            row["log_score"] = own["log_score"].sum().item() / total
+            ratio = (None, None, None) if nis is None else resampling.ratio(nis, count)
+            row |= _interval("nis_per_dof", ratio)
+            yield row | {"consistent_low": band[0], "consistent_high": band[1]}
 
 
 def reliability_rows(tally: Tally) -> Iterator[dict[str, Any]]:
     """Make the rows of reliability.csv: how often values came under their quantiles.
 
     Args:
-        tally: of an agent at a point.
+        tally: of an agent under a condition.
 
     Yields:
         Columns and values; ``under_5`` is the share of values under the 5 % quantile.
     """
-    for forecast, counts in tally.reliability.items():
-        total = tally.honesty[forecast]["count"].sum()
-        if not total > 0:
-            continue
-        shares = (counts.sum(0) / total).tolist()
-        yield {
-            "estimate": forecast.estimate,
-            "sensor_noise": "in" if forecast.noise else "out",
-            "held_against": forecast.target,
-            "entries": forecast.entries,
-            "count": int(total),
-        } | {f"under_{100 * p:g}": share for p, share in zip(LEVELS, shares, strict=True)}
+    for forecast, sums in tally.forecasts.items():
+        total = sums["count"].sum().item()
+        if total > 0:
+            shares = (sums["under"].sum(0) / total).tolist()
+            under = {f"under_{100 * p:g}": share for p, share in zip(LEVELS, shares, strict=True)}
+            yield {**_columns(forecast), "count": int(total), **under}
 
 
-def _classes(tally: Tally, sums: Mapping[str, Tensor]) -> Iterator[tuple[str, int | None]]:
-    """Yield all entries together, then each class that has any."""
-    counts = sums["count"].sum(0)
-    if counts.sum() > 0:
-        yield ALL, None
+def _columns(forecast: Forecast) -> dict[str, str]:
+    return {
+        "estimate": forecast.estimate,
+        "sensor_noise": "in" if forecast.noise else "out",
+        "held_against": forecast.target,
+        "entries": forecast.entries,
+    }
+
+
+def _classes(tally: Tally, sums: Sums) -> Iterator[tuple[str, Sums]]:
+    """Yield the sums of all entries together, then of each class that has any, (episodes,) each."""
+    if sums["count"].sum() > 0:
+        yield ALL, {name: value.sum(-1) for name, value in sums.items()}
     for index, name in enumerate(tally.classes):
-        if counts[index] > 0:
-            yield name, index
+        if sums["count"][:, index].sum() > 0:
+            by_class = sums.keys() - {"under", "nis_joint"}
+            yield name, {key: sums[key][:, index] for key in by_class}
 
 
-def _taken(sums: Tensor, index: int | None) -> Tensor:
-    """Return the sums of one class, or of all, shape (episodes,)."""
-    return sums.sum(-1) if index is None else sums[:, index]
-
-
-def _put(
-    row: dict[str, Any], name: str, values: tuple[float | None, float | None, float | None]
-) -> None:
-    row[name], row[f"{name}_low"], row[f"{name}_high"] = values
+def _interval(name: str, values: tuple[float | None, float | None, float | None]) -> dict[str, Any]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -96,27 +95,6 @@ def read_table(path: Path, needed: Iterable[str]) -> pd.DataFrame:
     if absent := [name for name in needed if name not in table]:
         raise UserError(f"`{path}` lacks the columns {', '.join(absent)}: is it another table?")
     return table
-
-
-def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
-    """Return run folders, each once, sorted; a pattern gives those with a config.yaml.
-
-    Raises:
-        UserError: if there is none, or one that is named does not exist.
-    """
-    found: dict[Path, Path] = {}
-    for text in [wanted] if isinstance(wanted, str) else wanted or []:
-        matches = [Path(path) for path in glob.glob(str(text), recursive=True)]
-        if glob.has_magic(str(text)):
-            matches = [path for path in matches if (path / "config.yaml").is_file()]
-        if not any(path.is_dir() for path in matches):
-            magic = glob.has_magic(str(text))
-            what = f"{text} matches none" if magic else f"there is no folder {text}"
-            raise UserError(f"`run` must name run folders, {what}.")
-        found |= {path.resolve(): path for path in sorted(matches)}
-    if not found:
-        raise UserError("`run` must name run folders: 'run=[runs/a,runs/b]' or 'run=runs/*'.")
-    return sorted(found.values())
 
 
 def read_runs(

@@ -1,10 +1,17 @@
-"""Evaluation: the first episode of each environment of a batch, with frozen statistics."""
+"""Whole episodes of a policy, each with random numbers of its own.
+
+Episodes run in batches of `BLOCK` simulators, however few are asked for: what an episode draws
+(its start, its gaps and noise, its actions, the particles of its belief) depends on its number and
+the seed alone, to the bit, so that more episodes only add to fewer.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from beliefs import Belief
 from tensordict import TensorDictBase
@@ -18,7 +25,13 @@ from training.envs import copy_statistics, make_environment
 
 from torchrl_drbpn import SensorReduction, seed_env
 
+BLOCK = 32
 _KINDS = {"sampled": ExplorationType.RANDOM, "mean": ExplorationType.DETERMINISTIC}
+# Of features. Observations are normalised: a million deviations from all that was ever seen is no
+# belief any more, and on its way to infinity.
+_FARTHEST = 1e6
+
+Watch = Callable[[slice, TensorDictBase, Tensor], None]
 
 
 @dataclass(frozen=True)
@@ -42,20 +55,17 @@ class Episodes:
     @property
     def mean_return(self) -> float:
         """Return the mean of the returns."""
-        return sum(self.returns) / len(self.returns)
+        return float(np.mean(self.returns))
 
     @property
     def std_return(self) -> float:
         """Return the standard deviation of the returns between episodes; 0 for one episode."""
-        if len(self.returns) < 2:
-            return 0.0
-        return torch.tensor(self.returns, dtype=torch.float64).std().item()
+        return float(np.std(self.returns, ddof=1)) if len(self.returns) > 1 else 0.0
 
     @property
     def missing_ratio(self) -> float:
         """Return the share of entries that did not arrive, over all steps and components."""
-        steps = sum(self.lengths)
-        return sum(r * n for r, n in zip(self.missing_ratios, self.lengths, strict=True)) / steps
+        return float(np.average(self.missing_ratios, weights=self.lengths))
 
     @property
     def log_likelihood(self) -> float | None:
@@ -65,11 +75,9 @@ class Episodes:
         """
         if self.log_likelihoods is None or any(self.diverged):
             return None
-        ratios = zip(self.missing_ratios, self.lengths, strict=True)
-        weights = [(1 - ratio) * length for ratio, length in ratios]
-        total = sum(v * w for v, w in zip(self.log_likelihoods, weights, strict=True))
+        arrived = (1 - np.array(self.missing_ratios)) * np.array(self.lengths)
         # The weights are counts over the number of components: one entry of many is below 1.
-        return total / max(sum(weights), 1e-12)
+        return float(arrived @ np.array(self.log_likelihoods) / max(arrived.sum(), 1e-12))
 
 
 def make_evaluation_environment(
@@ -77,153 +85,210 @@ def make_evaluation_environment(
     belief: Belief,
     agent: Agent,
     *,
-    episodes: int,
+    statistics: TransformedEnv,
     missingness: MissingnessSettings | None = None,
     noise: NoiseSettings | None = None,
     complete: bool = False,
     removed: Tensor | None = None,
 ) -> TransformedEnv:
-    """Build an environment like the training one, one simulator an episode.
+    """Build a batch of `BLOCK` environments like the training ones.
 
     Args:
         settings: of the run.
         belief: whose transforms are needed.
         agent: whose recurrent state is carried.
-        episodes: number of episodes.
+        statistics: the environment whose normalisation is used, frozen.
         missingness: what does not arrive; None: as in training.
         noise: what is added; None: as in training.
         complete: whether to write ``complete_observation`` too, for measurements alone.
         removed: components that never arrive, on top of ``missingness``: bool of shape
-            ``(episodes, obs)``; None: there are none.
+            ``(BLOCK, obs)``; None: there are none.
 
     Returns:
-        The environment. Its statistics are empty: see
-        :func:`training.envs.copy_statistics`.
+        The environment.
     """
-    reduction = [] if removed is None else [SensorReduction(removed)]
     env = make_environment(
         settings.env,
         missingness or settings.missingness,
         noise or settings.noise,
         settings.normalisation,
-        num_envs=episodes,
+        num_envs=BLOCK,
         num_threads=settings.collector.num_threads,
         gamma=settings.loss.gamma,
         seed=settings.evaluation.seed,
         complete=complete,
-        before_normalisation=reduction,
+        before_normalisation=[] if removed is None else [SensorReduction(removed)],
         after_normalisation=belief.transforms(),
     )
     add_primers(env, agent)
+    copy_statistics(statistics, env)
     return env
 
 
 def evaluate(
     policy: TensorDictModuleBase,
-    env: TransformedEnv,
+    make_env: Callable[[int], TransformedEnv],
     *,
+    episodes: int,
     mode: str,
     seed: int,
-    statistics: TransformedEnv | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Episodes | None:
-    """Run the first episode of each environment of a batch.
-
-    Only first episodes count, so that short episodes are not over-represented. The global
-    generator is left as it was found.
+    """Run episodes and add up what came of each.
 
     Args:
         policy: belief module and policy head.
-        env: batch size ``(episodes,)``.
+        make_env: see :func:`run_episodes`.
+        episodes: how many.
         mode: ``sampled`` actions or ``mean`` actions.
         seed: of episodes, corruption and sampled actions.
-        statistics: environment whose normalisation is used, frozen; None: that of ``env``.
         stop: asked at every step; if it returns True the evaluation is given up.
 
     Returns:
         The episodes, or None if it was given up.
     """
-    if statistics is not None:
-        copy_statistics(statistics, env)
+    returns, likelihoods = torch.zeros(2, episodes, dtype=torch.float64)
+    lengths, entries, observed = torch.zeros(3, episodes, dtype=torch.int64)
+    diverged = torch.zeros(episodes, dtype=torch.bool)
+    has_model = False
+
+    def add(rows: slice, data: TensorDictBase, running: Tensor) -> None:
+        nonlocal has_model
+        mask, value = data.get("observed"), data.get(("belief", "log_likelihood"), None)
+        lengths[rows] += running
+        entries[rows] += running * mask.shape[-1]
+        observed[rows] += running * mask.sum(-1)
+        returns[rows] += running * data.get(("next", "reward")).squeeze(-1)
+        if value is not None:
+            has_model = True
+            likelihoods[rows] += running * value.reshape(-1)
+        if "diverged" in data.keys():  # noqa: SIM118 - a tensordict is no dictionary
+            diverged[rows] |= running & data.get("diverged").squeeze(-1)
+
+    if not run_episodes(
+        policy, make_env, episodes=episodes, mode=mode, seed=seed, watch=add, stop=stop
+    ):
+        return None
+    return Episodes(
+        returns.tolist(),
+        lengths.tolist(),
+        (1 - observed / entries.double()).tolist(),
+        (likelihoods / observed.clamp_min(1)).tolist() if has_model else None,
+        diverged.tolist(),
+    )
+
+
+def run_episodes(
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    make_env: Callable[[int], TransformedEnv],
+    *,
+    episodes: int,
+    mode: str,
+    seed: int,
+    watch: Watch,
+    stop: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Run episodes to their ends, and show every step of them.
+
+    The global generator is left as it was found. The belief of an episode that is over begins anew
+    at every step: its row is not simulated, the policy sees its last observation again and again,
+    and a belief that went on with that could leave the range of its numbers.
+
+    Args:
+        policy: belief module and policy head.
+        make_env: builds the environment of the block of this number, batch size ``(BLOCK,)``; it is
+            closed afterwards.
+        episodes: how many.
+        mode: ``sampled`` actions or ``mean`` actions.
+        seed: of episodes, corruption and sampled actions.
+        watch: called after every step with the episodes of the block, the stepped tensordict of
+            these, and whether each was still running before the step, ``(episodes of the block,)``.
+        stop: asked at every step; if it returns True the episodes are given up.
+
+    Returns:
+        Whether every episode came to its end.
+    """
     with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(_KINDS[mode]):
-        torch.manual_seed(seed)
-        seed_env(env, seed)
-        return _first_episodes(policy, env, stop)
+        for block, first in enumerate(range(0, episodes, BLOCK)):
+            rows = slice(first, min(first + BLOCK, episodes))
+            count = rows.stop - first
+            own = int(np.random.SeedSequence((seed, block)).generate_state(1)[0])
+            with closing(make_env(block)) as env:
+                torch.manual_seed(own)
+                seed_env(env, own)
+                running = (torch.arange(BLOCK) < count).unsqueeze(-1)
+                root = leave_standing(env.reset(), running)
+                while running.any():
+                    if stop():
+                        return False
+                    # An episode that is over costs no simulation and changes no other row.
+                    data = env.step(policy(root).set("_step", running))
+                    watch(rows, data[:count], running[:count, 0])
+                    running = running & ~data.get(("next", "done"))
+                    root = leave_standing(env.step_mdp(data), running)
+    return True
 
 
 def leave_standing(root: TensorDictBase, running: Tensor) -> TensorDictBase:
-    """Let the beliefs of episodes that are over begin anew at every step.
-
-    Such a row is not simulated: the policy sees its last observation again and again, with actions
-    that nobody carries out, and a belief that goes on with that may leave the range of its numbers.
+    """Let the beliefs of episodes that are over begin anew.
 
     Args:
         root: of the next step; changed in place.
-        running: bool of shape ``(episodes, 1)``.
+        running: bool of shape ``(BLOCK, 1)``.
 
     Returns:
         The same tensordict.
     """
-    if running.all():
-        return root
-    root.set("is_init", root.get("is_init") | ~running)
-    carried = root.get("recurrent", None)
-    if carried is not None:
-        root.set("recurrent", carried.apply(lambda value: only_rows(running, value)))
+    if not running.all():
+        root.set("is_init", root.get("is_init") | ~running)
+        carried = root.get("recurrent", None)
+        if carried is not None:
+            root.set("recurrent", carried.apply(lambda value: _only_rows(running, value)))
     return root
 
 
-def only_rows(rows: Tensor, value: Tensor) -> Tensor:
-    """Put zeros into the other rows.
-
-    Args:
-        rows: bool of shape ``(episodes, 1)``.
-        value: shape ``(episodes, ...)``.
-
-    Returns:
-        Shape and dtype of ``value``.
-    """
+def _only_rows(rows: Tensor, value: Tensor) -> Tensor:
+    """Put zeros into the rows where ``rows``, of shape ``(batch, 1)``, is False."""
     return torch.where(rows.reshape(-1, *(1,) * (value.ndim - 1)), value, torch.zeros_like(value))
 
 
-def _first_episodes(
-    policy: TensorDictModuleBase, env: TransformedEnv, stop: Callable[[], bool]
-) -> Episodes | None:
-    """Step each environment until it has finished once; those that have are left standing."""
-    count = env.batch_size[0]
-    running = torch.ones(count, 1, dtype=torch.bool)
-    returns = torch.zeros(count, 1, dtype=torch.float64)
-    lengths = torch.zeros(count, 1, dtype=torch.int64)
-    observed = torch.zeros(count, 1, dtype=torch.int64)
-    log_likelihood = torch.zeros(count, 1, dtype=torch.float64)
-    diverged = torch.zeros(count, 1, dtype=torch.bool)
-    components, has_model = 0, False
-    root = env.reset()
-    while running.any():
-        if stop():
-            return None
-        # An episode that is over costs no simulation; its row of the batch changes no other row.
-        stepped = env.step(policy(root).set("_step", running))
-        mask = stepped.get("observed")
-        components = mask.shape[-1]
-        observed += mask.sum(-1, keepdim=True) * running
-        value = stepped.get(("belief", "log_likelihood"), None)
-        if value is not None:
-            has_model = True
-            log_likelihood += value.reshape(count, 1) * running
-        stopped = stepped.get("diverged", None)
-        if stopped is not None:
-            diverged |= stopped & running
-        returns += stepped.get(("next", "reward")) * running
-        lengths += running
-        running = running & ~stepped.get(("next", "done"))
-        root = leave_standing(env.step_mdp(stepped), running)
-    missing = 1 - observed / (lengths * components).double()
-    per_entry = log_likelihood / observed.clamp_min(1)
-    return Episodes(
-        returns.squeeze(-1).tolist(),
-        lengths.squeeze(-1).tolist(),
-        missing.squeeze(-1).tolist(),
-        per_entry.squeeze(-1).tolist() if has_model else None,
-        diverged.squeeze(-1).tolist(),
-    )
+class StoppingPolicy(TensorDictModuleBase):
+    """Act as ``agent.policy``; where the belief has diverged, with zero actions to the end.
+
+    Without its sensors a learned transition runs open loop and need not be stable. In training that
+    is an error; under test it is a result: ``diverged`` says so, and the other episodes go on.
+
+    Args:
+        agent: whose modules decide.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        self.belief, self.actor = agent.belief, agent.actor
+        self.in_keys = list(agent.policy.in_keys)
+        self.out_keys = [*agent.policy.out_keys, "diverged"]
+        self._stopped = torch.zeros(())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write belief, action and ``diverged``, bool of shape ``(batch, 1)``."""
+        checking = [m for m in self.belief.modules() if getattr(m, "validate", False)]
+        for part in checking:  # what is not finite is written, in the place of an error
+            part.validate = False
+        try:
+            tensordict = self.belief(tensordict)
+        finally:
+            for part in checking:
+                part.validate = True
+        written = {key: tensordict.get(key) for key in self.belief.out_keys}
+        numbers = {key: value for key, value in written.items() if value.is_floating_point()}
+        near = tensordict.get("features").abs().amax(-1, keepdim=True) < _FARTHEST
+        for value in numbers.values():
+            near = near & value.isfinite().reshape(len(value), -1).all(-1, keepdim=True)
+        stopped = ~near | (self._stopped.bool() & ~tensordict.get("is_init"))
+        self._stopped = stopped
+        # The row starts from zeros again, so that what reads it need not bear NaN.
+        for key, value in numbers.items() if stopped.any() else ():
+            tensordict.set(key, _only_rows(~stopped, value))
+        tensordict = self.actor(tensordict)
+        tensordict.set("action", _only_rows(~stopped, tensordict.get("action")))
+        return tensordict.set("diverged", stopped)

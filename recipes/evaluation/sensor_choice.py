@@ -16,7 +16,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 from training.errors import UserError
-from training.sensors import sensor_names
 
 from evaluation.trained import TrainedAgent
 from torchrl_drbpn import BeliefFilterModule, MaskedObservationNorm, select_sensors
@@ -56,18 +55,13 @@ class SensorModel:
         Args:
             criterion: "D": information; "A": the variance left in what the sensors would read
                 without noise, tr H P+ H', which no choice of the state's units changes.
-
-        Returns:
-            Indices.
         """
-        H, count = self.emission_matrix, len(self.names)
+        H, P, R = self.emission_matrix, self.predicted_cov, self.emission_cov
         target = H if criterion == "A" else None
-        return select_sensors(
-            H, self.predicted_cov, self.emission_cov, count, criterion=criterion, target=target
-        ).indices
+        return select_sensors(H, P, R, len(self.names), criterion=criterion, target=target).indices
 
     def along(self, orders: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Say what sensors tell, read in a given order.
+        r"""Return what sensors tell, read in a given order.
 
         With L L' the covariance of the readings in that order, and N N' that of their noise, the
         readings up to k tell sum_{i <= k} log(L_ii / N_ii) nats about the state.
@@ -79,13 +73,12 @@ class SensorModel:
             The information of the first k sensors, nats, and the share of tr H P H' that they
             leave, each of shape ``(*batch, count)``.
         """
-        H = self.emission_matrix
-        signal = H @ self.predicted_cov @ H.mT
         pairs = orders.unsqueeze(-1), orders.unsqueeze(-2)
         readings = torch.linalg.cholesky(self.observation_cov[pairs])
         noise = torch.linalg.cholesky(self.emission_cov[pairs])
         ratio = readings.diagonal(dim1=-2, dim2=-1) / noise.diagonal(dim1=-2, dim2=-1)
         # Columns of Cov(H s, readings) L^-T: what each reading explains beside those before it.
+        signal = self.observation_cov - self.emission_cov
         explained = torch.linalg.solve_triangular(readings, signal[orders], upper=False)
         taken = explained.square().sum(-1).cumsum(-1)
         return ratio.log().cumsum(-1), 1.0 - taken / signal.trace()
@@ -103,8 +96,7 @@ def learned_sensors(trained: TrainedAgent) -> SensorModel:
     Raises:
         UserError: if the belief has no H, P and R, or no P that holds at every step.
     """
-    name = trained.settings.belief.get("name")
-    module = trained.agent.belief
+    name, module = trained.settings.belief.get("name"), trained.agent.belief
     if not isinstance(module, BeliefFilterModule):
         raise UserError(
             f"`belief={name}` has learned no H, P and R to choose sensors by: take a run with "
@@ -118,11 +110,11 @@ def learned_sensors(trained: TrainedAgent) -> SensorModel:
             "(belief.transition.cov_network=true), so no one P ranks its sensors: take a run with "
             "cov_network=false."
         )
-    env, noise = trained.settings.env, trained.settings.noise
     norm = next(t for t in trained.statistics.transform if isinstance(t, MaskedObservationNorm))
+    noise = trained.settings.noise
     variance = (noise.sigma * noise.scale) ** 2 + noise.spike_probability * noise.spike_std**2
     return SensorModel(
-        sensor_names(env.id, env.version, model.obs_dim),
+        trained.sensors,
         trained.settings.seed,
         model.emission_matrix.double().detach(),
         model.constant_cov().double().detach(),
@@ -132,7 +124,7 @@ def learned_sensors(trained: TrainedAgent) -> SensorModel:
 
 
 def kept_sensors(trained: TrainedAgent, count: int) -> list[int]:
-    """Return the sensors that tell most about the state, by the learned H, P and R.
+    """Return the sensors that tell most about the state, by the learned H, P and R, best first.
 
     Greedy D-optimal, see :func:`torchrl_drbpn.select_sensors`; the first sensors of a larger count
     are those of a smaller one.
@@ -141,19 +133,7 @@ def kept_sensors(trained: TrainedAgent, count: int) -> list[int]:
         trained: the agent; its belief must be the belief filter.
         count: how many sensors to keep.
 
-    Returns:
-        Indices of components, best first.
-
     Raises:
-        UserError: if the belief has no H, P and R, or has not that many sensors.
+        UserError: if the belief has no H, P and R.
     """
-    model = learned_sensors(trained)
-    if not 0 <= count <= len(model.names):
-        raise UserError(
-            f"`count` must be from 0 to the {len(model.names)} sensors of "
-            f"{trained.settings.env.env_id}, got {count}."
-        )
-    chosen = select_sensors(
-        model.emission_matrix, model.predicted_cov, model.emission_cov, count, criterion="D"
-    )
-    return chosen.indices.tolist()
+    return learned_sensors(trained).ranking("D")[:count].tolist()

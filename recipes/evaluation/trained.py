@@ -1,23 +1,26 @@
-"""An agent that a run has trained, read from its folder."""
+"""An agent that a run has trained, read from its folder: the only place that builds one anew."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from beliefs import Belief
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
 from torchrl.envs import TransformedEnv
 from training.agent import Agent, add_primers
-from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
-from training.config import Settings, read_settings
-from training.console import say
+from training.checkpoint import last_checkpoint, load_checkpoint
+from training.config import MissingnessSettings, NoiseSettings, Settings, read_settings
 from training.envs import make_environment
 from training.errors import UserError
 from training.loop import make_agent
 from training.methods import method_name
 from training.run_folder import read_config
+from training.sensors import sensor_names
 
+from evaluation.episodes import BLOCK, make_evaluation_environment
 from torchrl_drbpn import BeliefFilterModule
 
 
@@ -31,7 +34,7 @@ class TrainedAgent:
         agent: with the trained weights.
         statistics: an environment that holds the trained normalisation.
         frames: environment steps of the checkpoint.
-        method: what it is called in tables and figures, see :mod:`training.methods`.
+        method: what it is called in tables and figures.
     """
 
     settings: Settings
@@ -41,18 +44,75 @@ class TrainedAgent:
     frames: int
     method: str
 
+    @property
+    def obs_dim(self) -> int:
+        """Return the number of sensors."""
+        return self.statistics.observation_spec["observation"].shape[-1]
 
-def load_trained_agent(folder: Path) -> TrainedAgent:
+    @property
+    def sensors(self) -> list[str]:
+        """Return the names of the sensors."""
+        return sensor_names(self.settings.env.id, self.settings.env.version, self.obs_dim)
+
+    @property
+    def observing_policy(self) -> TensorDictSequential:
+        """Return a policy that also writes what the belief knows of the sensors."""
+        make = self.belief.observing
+        return TensorDictSequential(make() if make else self.agent.belief, self.agent.actor)
+
+    def environments(
+        self,
+        missingness: MissingnessSettings | None = None,
+        noise: NoiseSettings | None = None,
+        removed: Tensor | None = None,
+        *,
+        complete: bool = False,
+    ) -> Callable[[int], TransformedEnv]:
+        """Return what builds the environment of each block of episodes.
+
+        Args:
+            missingness: what does not arrive; None: as in training.
+            noise: what is added to what arrives; None: as in training.
+            removed: components that never arrive, bool of shape ``(episodes, obs)``; None: none.
+            complete: whether to write ``complete_observation``, normalised alike.
+
+        Returns:
+            A function of the block's number, see :func:`evaluation.episodes.run_episodes`.
+        """
+
+        def make(block: int) -> TransformedEnv:
+            gone = None
+            if removed is not None:
+                gone = removed.new_zeros(BLOCK, self.obs_dim)
+                own = removed[block * BLOCK : (block + 1) * BLOCK]
+                gone[: len(own)] = own
+            return make_evaluation_environment(
+                self.settings,
+                self.belief,
+                self.agent,
+                statistics=self.statistics,
+                missingness=missingness,
+                noise=noise,
+                complete=complete,
+                removed=gone,
+            )
+
+        return make
+
+
+def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
     """Read the last checkpoint of a run.
 
     Args:
         folder: the run folder.
+        gate: standard deviations of the innovation, beyond which a reading counts as if at that
+            distance; None: every reading is believed. The agent's method names it.
 
     Returns:
         The agent and what it was trained with.
 
     Raises:
-        UserError: if the folder or the checkpoint can't be used.
+        UserError: if the folder or the checkpoint can't be used, or the gate is refused.
     """
     config = read_config(folder)
     settings = read_settings(config)
@@ -79,25 +139,11 @@ def load_trained_agent(folder: Path) -> TrainedAgent:
         raise UserError(
             f"`{path}` does not fit {folder / 'config.yaml'}: {' '.join(str(error).split())[:300]}"
         ) from error
-    return TrainedAgent(settings, belief, agent, statistics, frames, method_name(config))
+    trained = TrainedAgent(settings, belief, agent, statistics, frames, method_name(config))
+    return trained if gate is None else _gated(trained, gate)
 
 
-def gated(trained: TrainedAgent, gate: float | None) -> TrainedAgent:
-    """Let an agent bound what a reading far from its forecast does to its belief.
-
-    Args:
-        trained: the agent; its belief module is changed in place.
-        gate: standard deviations of the innovation; None: every reading is believed.
-
-    Returns:
-        The agent. Its method names the gate, so that no table or figure takes it for the one
-        without.
-
-    Raises:
-        UserError: if its belief forecasts no readings, or the gate is refused.
-    """
-    if gate is None:
-        return trained
+def _gated(trained: TrainedAgent, gate: float) -> TrainedAgent:
     module = trained.agent.belief
     if not isinstance(module, BeliefFilterModule):
         raise UserError(
@@ -109,21 +155,3 @@ def gated(trained: TrainedAgent, gate: float | None) -> TrainedAgent:
     except ValueError as error:
         raise UserError(str(error)) from error
     return replace(trained, method=f"{trained.method}, gate {gate:g}")
-
-
-def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
-    """Leave out runs that have not got to their first checkpoint, and say so.
-
-    Args:
-        folders: run folders.
-
-    Returns:
-        Those with a checkpoint; all, where none has one: reading the first says what is wrong.
-    """
-    found = [folder for folder in folders if checkpoint_frames(folder) is not None]
-    if not found:
-        return list(folders)
-    for folder in folders:
-        if folder not in found:
-            say(f"{folder.name}: left out, it has no checkpoint yet")
-    return found

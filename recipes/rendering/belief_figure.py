@@ -10,7 +10,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 from PIL import Image
 from training.errors import UserError
 
@@ -18,7 +17,7 @@ from rendering.trajectory import INTERVAL_95, Recording
 
 TRUTH, ARRIVED, BELIEF, MISSING = "#222222", "#111111", "#1f77c4", "#f8ddd2"
 ABSENT = "#e3997f"  # an entry of a mask that did not arrive
-DASHES = (0, (3, 1.5))
+_DASHES: Any = (0, (3, 1.5))
 _WIDTH_INCHES, _PANEL_INCHES, _STRIP_INCHES, _MASK_INCHES = 10.0, 1.05, 1.55, 0.75
 STYLE: Any = {
     "font.size": 9.5,
@@ -30,21 +29,6 @@ STYLE: Any = {
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
 }
-
-
-def most_missing(recording: Recording, count: int) -> list[int]:
-    """Return the sensors that missed most, in the order of the observation.
-
-    Args:
-        recording: of an episode.
-        count: how many sensors, at most.
-
-    Returns:
-        Their indices.
-    """
-    missed = (~recording.observed).sum(0)
-    ranked = np.argsort(-missed, kind="stable")[:count]
-    return sorted(int(i) for i in ranked)
 
 
 def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]) -> list[int]:
@@ -64,7 +48,8 @@ def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]
     if isinstance(wanted, int):
         if wanted < 1:
             raise UserError(f"`sensors` must be 1 or more, or a list, got {wanted}.")
-        return most_missing(recording, wanted)
+        missed = (~recording.observed).sum(0)
+        return sorted(np.argsort(-missed, kind="stable")[:wanted].tolist())
     indices = []
     for item in [wanted] if isinstance(wanted, str) else wanted:
         index = names.index(item) if item in names else item
@@ -77,63 +62,104 @@ def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]
 
 
 def draw_belief(
-    recording: Recording,
-    sensors: Sequence[int],
-    frames: Sequence[NDArray[np.uint8]],
-    *,
-    title: str,
+    recording: Recording, sensors: Sequence[int], *, pictures: int, title: str
 ) -> Figure:
     """Draw a strip of pictures, the mask of all sensors, and a panel a sensor.
 
     Args:
         recording: of an episode.
         sensors: indices of the sensors drawn.
-        frames: pictures of the robot at :func:`frame_steps`; empty for none.
+        pictures: how many of the robot, at most.
         title: above everything.
 
     Returns:
         The figure.
     """
-    heights = [_MASK_INCHES, *[_PANEL_INCHES] * len(sensors)]
-    if frames:
-        heights.insert(0, _STRIP_INCHES)
+    shown = min(pictures, len(recording.pictures))
+    heights = [_STRIP_INCHES] * bool(shown) + [_MASK_INCHES, *[_PANEL_INCHES] * len(sensors)]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(_WIDTH_INCHES, sum(heights) + 1.15), layout="constrained")
-        axes = figure.subplots(
-            len(heights), 1, sharex=True, height_ratios=heights, squeeze=False
-        ).ravel()
+        rows = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)
+        axes = list(rows.ravel())
         figure.suptitle(title, x=0.012, ha="left", fontsize=11.5, fontweight="bold")
-        rest = list(axes)
-        if frames:
-            _draw_frames(rest.pop(0), recording, frames)
-        _draw_mask(rest.pop(0), recording)
-        for axis, sensor in zip(rest, sensors, strict=True):
-            _draw_sensor(axis, recording, sensor)
-        axes[-1].set_xlabel("step of the episode")
-        time = _time(recording)
-        axes[-1].set_xlim(time[0] - 0.5, time[-1] + 0.5)
+        if shown:
+            _draw_strip(axes.pop(0), recording, shown)
+        draw_panels(axes, recording, sensors)
+        axes[-1].set_xlim(recording.steps[0] - 0.5, recording.steps[-1] + 0.5)
         figure.supylabel("sensor value in running standard deviations", fontsize=9.5)
         figure.legend(
-            handles=_legend(),
-            loc="outside lower center",
-            ncols=4,
-            frameon=False,
-            fontsize=9.5,
+            handles=legend_of(recording), loc="outside lower center", ncols=4, frameon=False
         )
     return figure
 
 
-def frame_steps(count: int, steps: int) -> list[int]:
-    """Return the steps in the middle of ``count`` equal parts of ``steps``.
+def draw_panels(axes: Sequence[Any], recording: Recording, sensors: Sequence[int]) -> None:
+    """Draw the mask of all sensors and, of some, truth, arrivals, gaps and belief over the steps.
 
     Args:
-        count: number of pictures.
-        steps: number of steps.
-
-    Returns:
-        Indices from 0.
+        axes: one for the mask, then one a sensor; they share the steps.
+        recording: of an episode.
+        sensors: indices of the sensors drawn.
     """
-    return [int((i + 0.5) * steps / count) for i in range(count)]
+    count, steps = len(recording.names), recording.steps
+    edges = (steps[0] - 0.5, steps[-1] + 0.5)
+    axes[0].imshow(
+        ~recording.observed.T,
+        extent=(*edges, count, 0),
+        aspect="auto",
+        interpolation="nearest",
+        cmap=mpl.colors.ListedColormap(["white", ABSENT]),
+        vmin=0,
+        vmax=1,
+    )
+    axes[0].set_yticks([])
+    axes[0].spines[["top", "right"]].set_visible(True)
+    missing = 100 * recording.missing_ratio
+    axes[0].set_title(f"all {count} sensors, a row each: {missing:.0f} % of the entries missing")
+    for axis, sensor in zip(axes[1:], sensors, strict=True):
+        seen = recording.observed[:, sensor]
+        truth, mean = recording.complete[:, sensor], recording.estimate[:, sensor]
+        arrived = np.where(seen, recording.arrived[:, sensor], np.nan)
+        half = INTERVAL_95 * recording.std[:, sensor]
+        # By what there is to know: a wide interval may leave the panel, a far estimate may not.
+        known = np.concatenate([truth, arrived, mean])
+        room = 0.12 * np.ptp(known[np.isfinite(known)]) + 0.05
+        low, high = np.nanmin(known) - room, np.nanmax(known) + room
+        gaps = np.where(seen, np.nan, 1)[None]
+        shade: Any = {"aspect": "auto", "interpolation": "nearest", "zorder": 0}
+        shade["cmap"] = mpl.colors.ListedColormap([MISSING])
+        axis.imshow(gaps, extent=(*edges, low, high), **shade)
+        axis.fill_between(steps, mean - half, mean + half, color=BELIEF, alpha=0.3, lw=0, zorder=2)
+        axis.plot(steps, mean, color=BELIEF, lw=2.2, alpha=0.75, zorder=3)
+        axis.plot(steps, truth, color=TRUTH, lw=0.9, ls=_DASHES, zorder=4)
+        axis.plot(steps, arrived, ".", color=ARRIVED, ms=4.5, mew=0, zorder=5)
+        axis.set_ylim(low, high)
+        axis.set_title(f"{recording.names[sensor]}  ({100 * (1 - seen.mean()):.0f} % missing)")
+        axis.locator_params(axis="y", nbins=4)
+    axes[-1].xaxis.get_major_locator().set_params(integer=True)
+    axes[-1].set_xlabel("step of the episode")
+
+
+def legend_of(recording: Recording) -> list[Any]:
+    """Return what explains the panels of a recording.
+
+    Args:
+        recording: whose belief may tell nothing, or have no interval.
+    """
+    line = mpl.lines.Line2D
+    handles: list[Any] = [
+        line([], [], color=TRUTH, lw=0.9, ls=_DASHES, label="true value, unknown to the agent"),
+        line([], [], color=ARRIVED, marker=".", ls="", ms=7, mew=0, label="what arrived"),
+        Patch(color=MISSING, label="nothing arrived"),
+    ]
+    name = "belief" if recording.told == "estimate" else "forecast"
+    if recording.told != "nothing" and np.isnan(recording.std).all():
+        handles.append(line([], [], color=BELIEF, lw=2.2, label=name))
+    elif recording.told != "nothing":
+        light = (*mpl.colors.to_rgb(BELIEF), 0.3)
+        label = f"{name} and its 95 % interval"
+        handles.append(Patch(facecolor=light, edgecolor=BELIEF, label=label))
+    return handles
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int, palette: bool = False) -> None:
@@ -158,81 +184,16 @@ def save_figure(figure: Figure, path: Path, *, dpi: int, palette: bool = False) 
         temporary.unlink(missing_ok=True)
 
 
-def _time(recording: Recording) -> NDArray[np.int64]:
-    return recording.first_step + np.arange(len(recording.poses))
-
-
-def _draw_frames(axis: Any, recording: Recording, frames: Sequence[NDArray[np.uint8]]) -> None:
-    """Put each picture above the steps around the one it shows."""
-    time = _time(recording)
-    part = len(time) / len(frames)
-    for index, frame in enumerate(frames):
-        left = time[0] - 0.5 + index * part
+def _draw_strip(axis: Any, recording: Recording, count: int) -> None:
+    """Put pictures above the steps around those they show: the middle of equal parts."""
+    part = len(recording.steps) / count
+    for index in range(count):
+        left = recording.steps[0] - 0.5 + index * part
         axis.imshow(
-            frame,
+            recording.pictures[int((index + 0.5) * part)],
             extent=(left + 0.02 * part, left + 0.98 * part, 0, 1),
             aspect="auto",
             interpolation="lanczos",
         )
     axis.set_ylim(0, 1)
     axis.axis("off")
-
-
-def _draw_mask(axis: Any, recording: Recording) -> None:
-    """Shade every entry of every sensor that did not arrive."""
-    time = _time(recording)
-    count = recording.observed.shape[1]
-    axis.imshow(
-        ~recording.observed.T,
-        extent=(time[0] - 0.5, time[-1] + 0.5, count, 0),
-        aspect="auto",
-        interpolation="nearest",
-        cmap=mpl.colors.ListedColormap(["white", ABSENT]),
-        vmin=0,
-        vmax=1,
-    )
-    axis.set_yticks([])
-    axis.set_title(
-        f"all {count} sensors, one row each: {100 * recording.missing_ratio:.0f} % of the entries "
-        "did not arrive"
-    )
-    axis.spines[["top", "right"]].set_visible(True)
-
-
-def _draw_sensor(axis: Any, recording: Recording, sensor: int) -> None:
-    """Draw truth, arrivals, gaps and belief of one sensor."""
-    time = _time(recording)
-    seen = recording.observed[:, sensor]
-    for start, stop in _runs(~seen):
-        axis.axvspan(time[start] - 0.5, time[stop - 1] + 0.5, color=MISSING, lw=0, zorder=0)
-    mean, band = recording.estimate[:, sensor], INTERVAL_95 * recording.std[:, sensor]
-    axis.fill_between(time, mean - band, mean + band, color=BELIEF, alpha=0.3, lw=0, zorder=2)
-    axis.plot(time, mean, color=BELIEF, lw=2.2, alpha=0.75, zorder=3)
-    axis.plot(time, recording.complete[:, sensor], color=TRUTH, lw=0.9, ls=DASHES, zorder=4)
-    axis.plot(
-        time[seen], recording.arrived[seen, sensor], ".", color=ARRIVED, ms=4.5, mew=0, zorder=5
-    )
-    missing = 100 * (1 - seen.mean())
-    axis.set_title(f"{recording.names[sensor]}  ({missing:.0f} % missing)")
-    axis.margins(y=0.12)
-    axis.locator_params(axis="y", nbins=4)
-
-
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the stretches (start, stop) in which flags hold."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _legend() -> list[Any]:
-    line = mpl.lines.Line2D
-    return [
-        line([], [], color=TRUTH, lw=0.9, ls=DASHES, label="true value, unknown to the agent"),
-        line([], [], color=ARRIVED, marker=".", ls="", ms=7, mew=0, label="what arrived"),
-        Patch(color=MISSING, label="nothing arrived"),
-        Patch(
-            facecolor=(*mpl.colors.to_rgb(BELIEF), 0.3),
-            edgecolor=BELIEF,
-            label="belief and its 95 % interval",
-        ),
-    ]

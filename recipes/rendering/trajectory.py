@@ -2,52 +2,51 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import gymnasium
 import numpy as np
 import torch
 from beliefs import ESTIMATE, ESTIMATE_VARIANCE, FORECAST, FORECAST_COV
-from evaluation.episodes import make_evaluation_environment
+from evaluation.conditions import Condition
+from evaluation.episodes import run_episodes
 from evaluation.trained import TrainedAgent
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
-from torchrl.envs import ExplorationType, set_exploration_type
-from training.config import MissingnessSettings, NoiseSettings
-from training.envs import copy_statistics
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from training.console import say
 from training.errors import UserError
-from training.sensors import sensor_names
 
-from torchrl_drbpn import seed_env
 from torchrl_drbpn.functional import zero_missing
 
 INTERVAL_95 = 1.959964  # half width of a normal's central 95 %, in standard deviations
-# What a belief says of the sensors: their values after looking, the readings before, or nothing.
+# What a belief tells of the sensors: their values after looking, the readings before, or nothing.
 Told = Literal["estimate", "forecast", "nothing"]
-_MODES = {"sampled": ExplorationType.RANDOM, "mean": ExplorationType.DETERMINISTIC}
+Picture = NDArray[np.uint8]
+_FAR = 0.9999  # depth of what is not there, 1 at the far end of the scene
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Part of an episode, step by step; sensor values in normalised units.
+    """Part of an episode, step by step; sensor values in normalised units, ``(time, obs)`` each.
 
     Attributes:
         task: Gymnasium id.
         names: of the sensor components.
         first_step: of the episode that is in here.
-        complete: what complete, noiseless sensors would have shown, shape ``(time, obs)``.
-        arrived: what arrived, 0 where nothing did, shape ``(time, obs)``.
-        observed: bool, True where something arrived, shape ``(time, obs)``.
-        estimate: what the belief says of every sensor, shape ``(time, obs)``; NaN where it says
-            nothing.
-        std: its standard deviation, of the belief filter the root of the diagonal of H P H', shape
-            ``(time, obs)``; NaN where the belief has none.
-        poses: simulator positions and velocities at each step.
-        rewards: raw, shape ``(time,)``.
-        model: the simulator's MuJoCo model.
+        complete: what complete, noiseless sensors would have shown.
+        arrived: what arrived, 0 where nothing did.
+        observed: bool, True where something arrived.
+        estimate: what the belief says of every sensor; NaN where it says nothing.
+        std: its standard deviation, of the belief filter the root of the diagonal of H P H'; NaN
+            where the belief has none.
         told: what ``estimate`` is: the sensor's value by what arrived until this step, the reading
-            foreseen from the step before, or nothing.
+            predicted from the step before, or nothing.
+        pictures: of the robot at each step; empty where it can't be drawn.
     """
 
     task: str
@@ -58,10 +57,13 @@ class Recording:
     observed: NDArray[np.bool_]
     estimate: NDArray[np.float64]
     std: NDArray[np.float64]
-    poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]]
-    rewards: NDArray[np.float64]
-    model: Any
-    told: Told = "estimate"
+    told: Told
+    pictures: list[Picture]
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """Return the number of each step in its episode."""
+        return self.first_step + np.arange(len(self.observed))
 
     @property
     def missing_ratio(self) -> float:
@@ -78,108 +80,160 @@ class Recording:
         return float(inside[missing].mean())
 
 
+class Camera:
+    """Draw the state of a simulator by Gymnasium's ``rgb_array``, in a twin that is put into it.
+
+    Args:
+        env_id: the task.
+        size: width and height of a picture, pixels; tasks without such arguments draw their own.
+    """
+
+    def __init__(self, env_id: str, size: tuple[int, int]) -> None:
+        if sys.platform.startswith("linux"):
+            os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed
+        options: dict[str, Any] = {"render_mode": "rgb_array", "disable_env_checker": True}
+        try:
+            made = gymnasium.make(env_id, width=size[0], height=size[1], **options)
+        except TypeError:
+            made = gymnasium.make(env_id, **options)
+        made.reset(seed=0)
+        self.twin: Any = made.unwrapped
+
+    def picture(self, simulator: Any) -> Picture:
+        """Return a picture ``(height, width, 3)``.
+
+        Args:
+            simulator: an unwrapped environment of the same task.
+
+        Raises:
+            RuntimeError: if its state can't be set, or nothing is drawn on this machine.
+        """
+        if hasattr(simulator, "data") and hasattr(self.twin, "set_state"):
+            self.twin.set_state(simulator.data.qpos, simulator.data.qvel)
+            picture = np.array(self.twin.render())
+            # White where there is nothing, as on the page around it.
+            depth = self.twin.mujoco_renderer.render("depth_array")
+            picture[np.asarray(depth) >= _FAR] = 255
+            return picture
+        if getattr(simulator, "state", None) is None:
+            raise RuntimeError(f"the state of {type(simulator).__name__} can't be set")
+        self.twin.state = simulator.state
+        return np.array(self.twin.render())
+
+
 def record_episode(
     trained: TrainedAgent,
-    missingness: MissingnessSettings,
+    condition: Condition,
+    removed: Tensor | None = None,
     *,
     mode: str,
     seed: int,
     start: int,
     steps: int,
-    noise: NoiseSettings | None = None,
-    removed: torch.Tensor | None = None,
+    picture_size: tuple[int, int] | None = None,
 ) -> Recording:
-    """Let a trained agent act and write down what it saw, missed and believed.
+    """Let a trained agent act and record what it saw, missed and believed.
+
+    The episode is the first of an evaluation with the same seed.
 
     Args:
         trained: the agent.
-        missingness: what does not arrive.
+        condition: what does not arrive or is wrong.
+        removed: of :func:`evaluation.conditions.removed_sensors`.
         mode: ``sampled`` actions or ``mean`` actions.
         seed: of the episode, the corruption and sampled actions.
         start: steps of the episode to leave out.
         steps: steps to keep; fewer where the episode ends before.
-        noise: what is added to what arrives; None: as in training.
-        removed: components that never arrive, on top of ``missingness``: bool of shape
-            ``(1, obs)``; None: there are none.
+        picture_size: width and height of the robot's pictures, pixels; None: no pictures.
 
     Returns:
-        The recording.
+        The recording. If nothing can be drawn, a printed line says why.
 
     Raises:
-        UserError: if the task is not MuJoCo's, or the episode is over before ``start``.
+        UserError: if the episode is over before ``start``.
     """
-    # Poses are read from Gymnasium's simulators, whatever the agent was trained on.
-    task = replace(trained.settings.env, backend="gymnasium")
-    settings = replace(trained.settings, env=task)
-    make = trained.belief.observing
-    belief = trained.agent.belief if make is None else make()
-    policy = TensorDictSequential(belief, trained.agent.actor)
-    env = make_evaluation_environment(
-        settings,
-        trained.belief,
-        trained.agent,
-        episodes=1,
-        missingness=missingness,
-        noise=noise,
-        complete=True,
-        removed=removed,
+    # States are read from Gymnasium's simulators, whatever the agent was trained on.
+    settings = trained.settings
+    local = replace(settings, env=replace(settings.env, backend="gymnasium"))
+    make = replace(trained, settings=local).environments(
+        condition.missingness, condition.noise, removed, complete=True
     )
-    copy_statistics(trained.statistics, env)
-    simulator = env.base_env.envs[0].unwrapped
-    if not hasattr(simulator, "data"):
-        raise UserError(f"`{settings.env.env_id}` is not a MuJoCo task: its poses are not known.")
-    rows: list[tuple[torch.Tensor, ...]] = []
-    poses, rewards = [], []
-    with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(_MODES[mode]):
-        torch.manual_seed(seed)
-        seed_env(env, seed)
-        data = env.reset()
-        for step in range(start + steps):
-            pose = simulator.data.qpos.copy(), simulator.data.qvel.copy()
-            data = policy(data)
-            if step >= start:
-                poses.append(pose)
-                rows.append(_sensors(data))
-                told = _told(data)
-            data = env.step(data)
-            if step >= start:
-                rewards.append(data["next", "reward"].item())
-            if data["next", "done"].item():
-                break
-            data = env.step_mdp(data)
+    camera = _camera(settings.env.env_id, picture_size) if picture_size else None
+    env: Any = None
+    rows: list[tuple[Tensor, ...]] = []
+    pictures: list[Picture] = []
+    done = 0
+    told: Told = "nothing"
+
+    def make_env(block: int) -> TransformedEnv:
+        nonlocal env
+        env = make(block)
+        return env
+
+    def policy(data: TensorDictBase) -> TensorDictBase:
+        nonlocal camera
+        if camera is not None and done >= start:
+            try:
+                pictures.append(camera.picture(env.base_env.envs[0].unwrapped))
+            except Exception as error:  # each OpenGL back end fails in its own way
+                _say_no_pictures(error)
+                camera = None
+        return observing(data)
+
+    def watch(_: slice, data: TensorDictBase, __: Tensor) -> None:
+        nonlocal done, told
+        if done >= start:
+            rows.append(_sensors(data[0]))
+            told = _told(data)
+        done += 1
+
+    observing = trained.observing_policy
+    run_episodes(
+        policy, make_env, episodes=1, mode=mode, seed=seed, watch=watch,
+        stop=lambda: done >= start + steps,
+    )  # fmt: skip
     if not rows:
-        raise UserError(f"`start` must lie inside the episode, which ended after {step + 1} steps.")
-    columns = (torch.stack(column).numpy() for column in zip(*rows, strict=True))
-    complete, arrived, observed, estimate, std = columns
-    out = Recording(
+        raise UserError(f"`start` must lie inside the episode, which ended after {done} steps.")
+    complete, arrived, observed, estimate, std = (
+        torch.stack(column).numpy() for column in zip(*rows, strict=True)
+    )
+    return Recording(
         settings.env.env_id,
-        sensor_names(settings.env.id, settings.env.version, complete.shape[-1]),
+        trained.sensors,
         start,
         complete,
         arrived,
         observed,
         estimate,
         std,
-        poses,
-        np.array(rewards),
-        simulator.model,
         told,
+        pictures if len(pictures) == len(rows) else [],
     )
-    env.close()
-    return out
+
+
+def _camera(env_id: str, size: tuple[int, int]) -> Camera | None:
+    try:
+        return Camera(env_id, size)
+    except Exception as error:
+        _say_no_pictures(error)
+        return None
+
+
+def _say_no_pictures(error: Exception) -> None:
+    reason = " ".join(str(error).split())[:200] or type(error).__name__
+    say(f"no pictures of the robot, off-screen rendering failed: {reason}")
 
 
 def _told(data: TensorDictBase) -> Told:
-    """Say what the belief has written of the sensors; what it says after looking goes first."""
+    """Return what the belief has written of the sensors; what it says after looking goes first."""
     keys = data.keys(include_nested=True)
     if ESTIMATE in keys:
         return "estimate"
     return "forecast" if FORECAST in keys else "nothing"
 
 
-def _sensors(data: TensorDictBase) -> tuple[torch.Tensor, ...]:
+def _sensors(data: TensorDictBase) -> tuple[Tensor, ...]:
     """Return complete, arrived, observed, estimate and its deviation, shape (obs,) each."""
-    data = data[0]
     complete, observed = data["complete_observation"].double(), data["observed"].clone()
     unknown = torch.full_like(complete, torch.nan)
     estimate, variance = data.get(ESTIMATE, None), data.get(ESTIMATE_VARIANCE, None)

@@ -347,7 +347,7 @@ def missingness_name(missingness: MissingnessSettings) -> str:
         missingness: mechanism, eta and, of outages, their length and groups.
 
     Returns:
-        Text that :func:`evaluation.conditions.read_point` reads back.
+        Text that :func:`evaluation.conditions.parse_condition` reads back.
     """
     m = missingness
     if m.mechanism == "outages":

@@ -95,7 +95,6 @@ class _Run:
         self.logger: Logger = get_logger(
             settings.logger.backend, logger_name=str(folder), experiment_name="logs"
         )
-        self.evaluation_envs: dict[int, TransformedEnv] = {}
         self.clock = time.perf_counter()
         self.saved_frames = training.progress.frames if resumed else -1
 
@@ -186,18 +185,20 @@ class _Run:
 
     def _evaluate_modes(self, kind: str, episodes: int) -> list[dict[str, Any]] | None:
         settings, training = self.settings, self.training
-        if episodes not in self.evaluation_envs:
-            self.evaluation_envs[episodes] = make_evaluation_environment(
-                settings, training.belief, training.agent, episodes=episodes
+
+        def make_env(_: int) -> TransformedEnv:
+            return make_evaluation_environment(
+                settings, training.belief, training.agent, statistics=training.env
             )
+
         rows = []
         for mode in settings.evaluation.modes:
             result = evaluate(
                 training.agent.policy,
-                self.evaluation_envs[episodes],
+                make_env,
+                episodes=episodes,
                 mode=mode,
                 seed=settings.evaluation.seed,
-                statistics=training.env,
                 stop=lambda: bool(self.stop),
             )
             if result is None:

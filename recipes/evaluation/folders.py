@@ -1,0 +1,78 @@
+"""Run folders that a command line names."""
+
+from __future__ import annotations
+
+import glob
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from training.checkpoint import checkpoint_frames
+from training.console import say
+from training.errors import UserError
+
+
+def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
+    """Return run folders in a fixed order.
+
+    Args:
+        wanted: folders or patterns; a folder that exists is no pattern, whatever its name holds.
+
+    Returns:
+        Folders, each once, sorted. A pattern gives the folders with a config.yaml.
+
+    Raises:
+        UserError: if there is none, or one that is named does not exist.
+    """
+    found: list[Path] = []
+    for text in [wanted] if isinstance(wanted, str) else wanted or []:
+        if Path(text).is_dir():
+            found.append(Path(text))
+        elif glob.has_magic(text):
+            matches = [Path(path) for path in glob.glob(text, recursive=True)]
+            runs = [path for path in matches if (path / "config.yaml").is_file()]
+            if not runs:
+                raise UserError(f"`run` must name run folders, {text} matches none.")
+            found += runs
+        else:
+            raise UserError(
+                f"`run` must name run folders, there is no folder {text}: give the one that "
+                "ppo_drbpn.py printed."
+            )
+    if not found:
+        raise UserError("`run` must name run folders: run=<folder>, run=[a,b] or 'run=runs/*'.")
+    # One folder given twice, by a name and by a pattern, is one run.
+    return sorted({path.resolve(): path for path in sorted(found)}.values())
+
+
+def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
+    """Leave out runs that have not got to their first checkpoint, and say so.
+
+    Args:
+        folders: run folders.
+
+    Returns:
+        Those with a checkpoint; all, where none has one: reading the first says what is wrong.
+    """
+    found = [folder for folder in folders if checkpoint_frames(folder) is not None]
+    for folder in folders if found else ():
+        if folder not in found:
+            say(f"{folder.name}: left out, it has no checkpoint yet")
+    return found or list(folders)
+
+
+def override(key: str, value: object) -> str:
+    """Return ``key=value`` as it can be pasted into a shell, for Hydra to read.
+
+    Args:
+        key: of the configuration.
+        value: its value, such as a path whose name holds blanks, commas or brackets.
+
+    Returns:
+        A word of a command line, quoted where it must be.
+    """
+    text = str(value)
+    if not all(c.isalnum() or c in "/_-.+:" for c in text):
+        # Hydra reads a backslash as itself, except before a quote.
+        text = "'" + text.replace("\\'", "\\\\'").replace("'", "\\'") + "'"
+    return shlex.quote(f"{key}={text}")

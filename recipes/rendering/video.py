@@ -1,0 +1,182 @@
+"""The film of an agent at work: the robot, its sensors, what is missing, and the belief.
+
+TorchRL's PixelRenderTransform can't make the frames: a transform of the environment draws an
+observation before the agent has read it, and the belief of that step is not there yet. So an
+episode is recorded first and drawn afterwards. TorchRL's VideoRecorder hands its frames to a
+logger, none of which writes a GIF or takes a file's name; imageio does both.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import imageio.v3 as iio
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+from training.errors import UserError
+
+from rendering.belief_figure import STYLE, draw_panels, legend_of
+from rendering.trajectory import Picture, Recording
+
+_PALETTE_FRAMES = 8  # from as many frames the colours of a GIF are taken
+FASTEST = 50  # frames a second; a GIF counts in hundredths of a second
+_INCHES = (6.4, 4.0)
+_ROBOT = (0.0, 0.12, 0.36, 0.8)  # left, bottom, width and height, in parts of the film
+_SMALL: dict[str, Any] = {
+    "font.size": 7.5,
+    "axes.titlesize": 7.5,
+    "axes.titlepad": 2.5,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+}
+
+
+def film_size(width: int) -> tuple[int, int]:
+    """Return width and height of a film, both even: video codecs take no others.
+
+    Args:
+        width: pixels.
+    """
+    return 2 * (width // 2), 2 * round(width * _INCHES[1] / _INCHES[0] / 2)
+
+
+def robot_size(width: int) -> tuple[int, int]:
+    """Return width and height of the robot's pictures in a film.
+
+    Args:
+        width: of the film, pixels.
+    """
+    across, upward = film_size(width)
+    return round(_ROBOT[2] * across), round(_ROBOT[3] * upward)
+
+
+class Film(Sequence[Picture]):
+    """Frames of an episode, each drawn when it is asked for.
+
+    The panels are drawn once, over the whole recording; a frame shows the window of steps up to its
+    own.
+
+    Args:
+        recording: of an episode.
+        sensors: indices of the sensors that get a panel.
+        steps: indices into the recording, one a frame.
+        window: steps that a panel looks back.
+        width: pixels.
+        title: in the first line.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        sensors: Sequence[int],
+        *,
+        steps: Sequence[int],
+        window: int,
+        width: int,
+        title: str,
+    ) -> None:
+        self.recording, self.steps, self.window = recording, list(steps), window
+        self.width, self.height = film_size(width)
+        with mpl.rc_context(STYLE | _SMALL):
+            dpi = width / _INCHES[0]
+            # A canvas rounds down: the hundredth keeps it from losing a pixel.
+            inches = (self.width + 0.01) / dpi, (self.height + 0.01) / dpi
+            figure = Figure(figsize=inches, dpi=dpi)
+            self._canvas: Any = FigureCanvasAgg(figure)
+            figure.text(0.012, 0.965, title, fontsize=8.5, fontweight="bold", va="center")
+            self._now = figure.text(0.985, 0.965, "", ha="right", va="center")
+            self._robot: Any = None
+            if recording.pictures:
+                axis = figure.add_axes(_ROBOT)
+                axis.axis("off")
+                self._robot = axis.imshow(recording.pictures[0], interpolation="lanczos")
+            grid = figure.add_gridspec(
+                len(sensors) + 1,
+                1,
+                left=0.43 if recording.pictures else 0.075,
+                right=0.985,
+                bottom=0.17,
+                top=0.91,
+                hspace=0.55,
+            )
+            self.axes = list(grid.subplots(sharex=True, squeeze=False).ravel())
+            draw_panels(self.axes, recording, sensors)
+            place: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 0.0), "fontsize": 7}
+            figure.legend(handles=legend_of(recording), ncols=4, frameon=False, **place)
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.steps)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Draw a frame, ``(height, width, 3)``, or a list of several."""
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        now = self.steps[index]
+        step, seen = self.recording.steps[now], self.recording.observed[now]
+        self._now.set_text(f"step {step}: {seen.sum()} of {len(seen)} sensors arrived")
+        self.axes[0].set_xlim(step - self.window + 0.5, step + 0.5)
+        if self._robot is not None:
+            self._robot.set_data(self.recording.pictures[now])
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+
+def check_video(path: Path, fps: float) -> None:
+    """Refuse a film that could not be written, before any work is done for it.
+
+    Args:
+        path: where it is to be; a name that ends in .gif or .mp4.
+        fps: frames a second.
+
+    Raises:
+        UserError: if the writer is not installed, or ``fps`` out of range.
+    """
+    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise UserError(
+            "`out` as .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or take "
+            f"{path.with_suffix('.gif').name}."
+        )
+    if not 1 <= fps <= FASTEST:
+        raise UserError(f"`fps` must be in [1, {FASTEST}], got {fps}.")
+
+
+def write_video(path: Path, frames: Sequence[Picture], *, fps: float, colours: int) -> None:
+    """Write a film whole or not at all; its suffix says which.
+
+    Args:
+        path: the GIF or MP4 file.
+        frames: pictures ``(height, width, 3)``.
+        fps: frames a second, of a GIF to the next hundredth of a second a frame.
+        colours: of a GIF; fewer make a smaller file.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        if path.suffix == ".mp4":
+            # H.264 works in blocks of 16 pixels, but asks for even sides only.
+            options: dict[str, Any] = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2}
+            pictures = list(frames)
+        else:
+            options = {"plugin": "pillow", "duration": 10 * round(100 / fps), "loop": 0}
+            pictures = list(_few_colours(frames, colours))
+        iio.imwrite(temporary, cast(Any, pictures), **options)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _few_colours(frames: Sequence[Picture], colours: int) -> Iterator[Picture]:
+    """Draw all frames in the same colours, without dithering: what stands still costs nothing."""
+    count = min(_PALETTE_FRAMES, len(frames))
+    some = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, count)]
+    palette = Image.fromarray(np.concatenate(some)).quantize(colours, kmeans=1)
+    for frame in frames:
+        few = Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        yield np.asarray(few.convert("RGB"))

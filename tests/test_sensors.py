@@ -1,0 +1,83 @@
+"""Names of sensors and what fails together by them.
+
+Every component of every MuJoCo task has a name of its own, in the simulator's order. Sensors that
+fail together share a joint or a kind.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+pytest.importorskip("hydra")
+from recipe_tools import make_config  # isort: skip
+
+from training.errors import UserError
+from training.sensor_groups import sensor_groups
+from training.sensors import named_tasks, sensor_names
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("task", "version"), named_tasks(), ids=lambda value: value)
+def test_every_component_of_a_task_has_a_name_of_its_own(task: str, version: str) -> None:
+    env = gymnasium.make(f"{task}-{version}")
+    names = sensor_names(task, version, env.observation_space.shape[0])
+    env.close()
+    assert len(set(names)) == len(names) == env.observation_space.shape[0]
+
+
+def test_all_tasks_of_the_recipe_have_names_in_both_versions() -> None:
+    folder = Path(__file__).parents[1] / "conf" / "env"
+    tasks = {make_config(f"env={path.stem}")["env"]["id"] for path in folder.glob("*.yaml")}
+    assert set(named_tasks()) == {(task, version) for task in tasks for version in ("v4", "v5")}
+
+
+def test_angles_and_velocities_are_where_the_simulator_has_them() -> None:
+    names = sensor_names("Walker2d", "v5", 17)
+    env = gymnasium.make("Walker2d-v5").unwrapped
+    joints = [env.model.joint(i).name for i in range(env.model.njnt)]
+    assert joints[3:6] == ["thigh_joint", "leg_joint", "foot_joint"]
+    assert names[2:5] == ["right thigh angle", "right leg angle", "right foot angle"]
+    assert names[8] == "torso x velocity"
+    assert names[11:14] == ["right thigh velocity", "right leg velocity", "right foot velocity"]
+
+
+def test_an_unknown_task_has_numbers_for_names_and_a_known_one_of_another_size_is_refused() -> None:
+    assert sensor_names("Pusher", "v5", 2) == ["component 0", "component 1"]
+    with pytest.raises(UserError, match=r"`Hopper-v5` has 11 named components.* has 12"):
+        sensor_names("Hopper", "v5", 12)
+
+
+def test_groups_hold_every_component_once_in_every_named_task() -> None:
+    sizes = {("Reacher", "v4"): 11, ("Reacher", "v5"): 10}
+    for task, version in named_tasks():
+        grouped = 0
+        for obs_dim in [sizes[task, version]] if (task, version) in sizes else range(4, 400):
+            try:
+                names = sensor_names(task, version, obs_dim)
+            except UserError:
+                continue  # no size of this task; some size is
+            grouped += 1
+            for by in ("joint", "kind"):
+                groups = sensor_groups(names, by)
+                assert groups is not None
+                assert sorted(i for group in groups for i in group) == list(range(obs_dim))
+                assert 1 < len(groups) < obs_dim, (task, by)
+        assert grouped, (task, version)
+
+
+def test_a_joint_is_its_angle_and_its_velocity_and_a_kind_all_positions() -> None:
+    names = sensor_names("Hopper", "v5", 11)
+    assert sensor_groups(names, "sensor") is None
+    joints = sensor_groups(names, "joint")
+    assert joints == [[0, 1, 5, 6, 7], [2, 8], [3, 9], [4, 10]]
+    assert sensor_groups(names, "kind") == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9, 10]]
+
+
+def test_groups_need_names() -> None:
+    with pytest.raises(UserError, match="goes by the names of the sensors"):
+        sensor_groups(["component 0", "component 1"], "joint")
+    with pytest.raises(UserError, match="`group_by` must be sensor, joint or kind"):
+        sensor_groups(["pole angle"], "leg")
