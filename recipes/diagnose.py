@@ -25,6 +25,7 @@ from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.config import check_mode, missingness_name
 from training.console import say, start
+from training.envs import env_name
 from training.errors import UserError
 from training.run_folder import write_whole
 
@@ -135,7 +136,7 @@ def _diagnoses(
             yield (
                 {
                     "run": folder.name,
-                    "task": settings.env.env_id,
+                    "task": env_name(settings),
                     "belief": belief,
                     "method": trained.method,
                     "training_seed": settings.seed,

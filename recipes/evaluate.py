@@ -27,7 +27,7 @@ from rendering.belief_figure import save_figure
 from training.config import check_mode
 from training.console import say, start
 from training.errors import UserError
-from training.sensor_groups import have_names
+from training.sensors import have_names
 
 
 def run(config: dict[str, Any]) -> int:

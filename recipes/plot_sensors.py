@@ -21,6 +21,7 @@ from omegaconf import DictConfig
 from rendering.belief_figure import save_figure
 from training.config import missingness_name
 from training.console import say, start
+from training.envs import env_name
 from training.errors import UserError
 from training.run_folder import write_table
 
@@ -83,7 +84,7 @@ def _title(trained: TrainedAgent) -> str:
     """Name what the runs of one column have in common."""
     settings = trained.settings
     what = f"trained on {missingness_name(settings.missingness)}, sigma {settings.noise.sigma:g}"
-    return f"{settings.env.env_id}, {trained.method}\n{what}"
+    return f"{env_name(settings)}, {trained.method}\n{what}"
 
 
 def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, Any]]:
@@ -101,7 +102,7 @@ def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, An
     """
     settings = trained.settings
     common = {
-        "env": settings.env.env_id,
+        "env": env_name(settings),
         "method": trained.method,
         "trained_on": missingness_name(settings.missingness),
         "noise_sigma": settings.noise.sigma,

@@ -1,29 +1,278 @@
 """Train an agent on incomplete, noisy sensors: ``python recipes/ppo_drbpn.py env=walker2d``.
 
 Settings and their defaults stand in conf/. A run leaves its configuration, tables, checkpoints and
-versions in ``runs/<env>-<version>-<belief>-seed<seed>-<time>``; ``resume=<that folder>`` continues
-it. Ctrl-C and SIGTERM save after the rollout in progress and leave with status 130 or 143.
+versions in ``runs/<task>-<belief>-seed<seed>-<time>``; ``resume=<that folder>`` continues it.
+Ctrl-C and SIGTERM save after the rollout in progress and leave with status 130 or 143.
 """
 
 from __future__ import annotations
 
 import contextlib
 import sys
+import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
+import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-from training.console import run_or_explain
-from training.resume import resumed_config
-from training.run import run
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torch.linalg import LinAlgError  # type: ignore[attr-defined]
+from tqdm import tqdm
+from training.agent import add_primers, make_agent
+from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
+from training.config import build, checked, command_line, explained, one_line, run_command
+from training.console import StopRequest, say, show
+from training.envs import env_name, make_env
+from training.errors import DivergedError, EnvironmentFault, UserError
+from training.evaluation import evaluate_training
+from training.ppo import add_advantages, finished_episodes, rollout_metrics
+from training.reward_scale import ReturnStatistics
+from training.run_folder import (
+    RunLog,
+    is_evaluated,
+    locked,
+    resumed_config,
+    write_config,
+    write_versions,
+)
+from training.state import Training
 
-# A resumed run stays in its own folder; see hydra.run.dir in conf/config.yaml.
-OmegaConf.register_new_resolver("run_folder", lambda resume, new: resume or new, replace=True)
+from torchrl_drbpn import BeliefDivergedError
 
 
-def train(config: DictConfig) -> int:
+def assemble(config: DictConfig) -> Training:
+    """Build everything a run needs, from its seed.
+
+    The global generator of torch is seeded here: initial weights and sampled actions come from it.
+
+    Args:
+        config: of the run.
+
+    Returns:
+        The parts, before the first frame.
+
+    Raises:
+        UserError: if a part refuses its settings.
+    """
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    env = make_env(config)
+    agent = make_agent(config, env)
+    add_primers(env, agent)
+    loss = build("loss", config.loss, agent)
+    steps = build("optim", config.optim, agent.parameters())
+    gae = build("advantage", config.advantage)
+    gae.set_keys(reward="scaled_reward")
+    return Training(
+        env=env,
+        agent=agent,
+        collector=build("collector", config.collector, env, agent.policy),
+        gae=gae,
+        algorithm=build(
+            "algo", config.algo, agent, loss=loss, steps=steps, gae=gae, seed=config.seed
+        ),
+        scale_reward=build("normalisation.reward", config.normalisation.reward),
+        reward_statistics=ReturnStatistics.start(env.batch_size[0]),
+    )
+
+
+def collect(training: Training) -> TensorDictBase:
+    """Collect one rollout; scale its rewards and normalise the observations that follow its steps.
+
+    Args:
+        training: of which the environment moves on and the statistics of rewards learn.
+
+    Returns:
+        The rollout, batch size ``(environments, time)``.
+
+    Raises:
+        EnvironmentFault: if the environment fails, or gives numbers that are none.
+    """
+    try:
+        # The collector writes every rollout into the same tensors; what is entered is not its own.
+        data = training.collector.rollout().copy()
+    except (BeliefDivergedError, LinAlgError):
+        raise
+    except Exception as error:  # whatever a simulator raises
+        raise EnvironmentFault(f"the environment failed: {one_line(error)}") from error
+    following = data.get("next")
+    arrived = following["observation"].where(following["observed"], 0.0)
+    for name, value in (("reward", following["reward"]), ("observation", arrived)):
+        wrong = (~value.isfinite()).flatten(1).any(1).nonzero()
+        if len(wrong):
+            raise EnvironmentFault(f"the {name} of environment {int(wrong[0])} is not finite.")
+    scaled, training.reward_statistics = training.scale_reward(
+        following["reward"], following["done"], training.reward_statistics
+    )
+    following.set("scaled_reward", scaled)
+    training.agent.norm(following)
+    return data
+
+
+def train_rollout(
+    training: Training, config: DictConfig
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Collect one rollout and learn from it.
+
+    Args:
+        training: changed in place.
+        config: of the run.
+
+    Returns:
+        What there is to log, times left out, and a row for each episode that finished.
+    """
+    if training.frames == 0:
+        # First statistics, from a rollout that is not trained on.
+        training.agent.norm.update(collect(training))
+        training.start_episodes()
+    remaining = max(0.0, 1 - training.frames / config.total_frames)
+    data = collect(training)
+    add_advantages(data, training.agent, training.gae)
+    metrics = rollout_metrics(data)
+    update = training.algorithm.update(data, remaining)
+    training.agent.norm.update(data)
+    training.frames += data.numel()
+    finished = finished_episodes(data, training.frames)
+    training.episodes += len(finished)
+    training.returns.extend(episode["return"] for episode in finished)
+    recent = training.returns
+    row = {
+        "frames": training.frames,
+        "episodes": training.episodes,
+        "return": sum(recent) / len(recent) if recent else None,
+        **metrics,
+        **training.agent.summary(),
+    }
+    # The rollout's own log-likelihood, of data not yet learned from, goes before the update's.
+    return update | row, finished
+
+
+def train(config: DictConfig, folder: Path) -> int:
+    """Train an agent to the end, or until a signal; save it; evaluate it.
+
+    Args:
+        config: of the run; ``resume`` names ``folder`` to go on from its last checkpoint.
+        folder: the run folder.
+
+    Returns:
+        Exit status: 0, or 130 or 143 where Ctrl-C or SIGTERM stopped the run. It was saved then.
+
+    Raises:
+        UserError: if a setting, the folder or a checkpoint can't be used, or training diverges.
+    """
+    training = assemble(config)
+    with locked(folder), StopRequest() as stop:
+        frames = evaluated = None
+        if config.resume is None:
+            if (folder / "config.yaml").exists():
+                raise UserError(
+                    f"`{folder}` holds a run already: name another folder, or resume={folder}."
+                )
+        else:
+            path = last_checkpoint(folder)
+            training.load_state_dict(load_checkpoint(path), str(path))
+            frames, evaluated = training.frames, training.evaluated_frames
+            if frames > config.total_frames:
+                raise UserError(
+                    f"`total_frames` must be at least the {frames:,} that `{folder}` has been "
+                    f"trained for, got {config.total_frames:,}."
+                )
+            if frames == config.total_frames and is_evaluated(folder, config):
+                say(f"`{folder}` is at its end; more total_frames go on with it")
+                return 0
+            if not training.env.base_env.supports_state:
+                say(f"{env_name(config)} can't save its state here: going on with new episodes")
+        log = RunLog(folder, config, list(training.agent.summary()), frames, evaluated)
+        write_config(folder, config)
+        write_versions(folder)
+        say(f"run folder: {folder}")
+        _loop(training, config, folder, log, stop)
+    training.collector.shutdown()
+    return stop.exit_code
+
+
+def _loop(
+    training: Training, config: DictConfig, folder: Path, log: RunLog, stop: StopRequest
+) -> None:
+    saved = first = training.frames
+    first_seconds = training.seconds
+    keep, save_every = config.checkpoint.keep, config.checkpoint.every_frames
+
+    def save(simulators: bool = True) -> None:
+        nonlocal saved
+        state = training.state_dict(simulators=simulators)
+        save_checkpoint(folder, training.frames, state, keep=keep)
+        saved = training.frames
+
+    def evaluate_when_due() -> None:
+        every, episodes = config.evaluation.every_frames, config.evaluation.episodes
+        due = every and training.frames // every > max(training.evaluated_frames, 0) // every
+        if not due or not episodes or training.frames >= config.total_frames:
+            return  # the final evaluation follows the last frame
+        rows = evaluate_training(config, training, "training", episodes, lambda: bool(stop))
+        if rows is not None:  # stopped: due again when the run is resumed
+            training.evaluated_frames = training.frames
+            log.evaluation(rows)
+            bar.clear()
+            say(_summary(rows))
+
+    with tqdm(
+        total=config.total_frames, initial=training.frames, unit="step", unit_scale=True,
+        dynamic_ncols=True, smoothing=0.1, mininterval=1.0,
+    ) as bar:  # fmt: skip
+        evaluate_when_due()  # one that a signal cut short
+        while training.frames < config.total_frames and not stop:
+            before, clock = training.frames, time.perf_counter()
+            try:
+                row, finished = train_rollout(training, config)
+            except EnvironmentFault as error:
+                if before > saved:  # without the simulators: a resumed run starts new episodes
+                    save(simulators=False)
+                raise _stopped(error, before, saved, folder) from error
+            except (DivergedError, BeliefDivergedError, LinAlgError, ValueError) as error:
+                raise _stopped(error, before, saved, folder) from error
+            seconds = time.perf_counter() - clock
+            training.seconds += seconds
+            row["steps_per_second"] = (training.frames - before) / seconds
+            row["wall_time"] = training.seconds
+            log.rollout(row, finished)
+            show(bar, row)
+            evaluate_when_due()
+            if training.frames // save_every > saved // save_every:
+                save()
+    if training.frames != saved:
+        save()
+    if training.seconds > first_seconds:
+        speed = (training.frames - first) / (training.seconds - first_seconds)
+        say(f"{speed:.0f} steps/s in collection and update, start-up and evaluation excluded")
+    if stop:
+        say(f"stopped and saved; continue with resume={folder}")
+    elif episodes := config.evaluation.final_episodes:
+        rows = evaluate_training(config, training, "final", episodes, lambda: bool(stop))
+        if rows is not None:
+            log.evaluation(rows)
+            say(_summary(rows))
+
+
+def _stopped(error: Exception, before: int, saved: int, folder: Path) -> UserError:
+    kept = f" Its last checkpoint, at {saved:,} steps, is in {folder}." if saved else ""
+    return UserError(f"training stopped at {before:,} steps: {one_line(error)}{kept}")
+
+
+def _summary(rows: list[dict[str, Any]]) -> str:
+    parts = [
+        f"{row['mode']} actions {row['return_mean']:.1f} +- {row['return_std']:.1f}" for row in rows
+    ]
+    first = rows[0]
+    return (
+        f"{first['kind']} evaluation at {first['frames']:,} steps, {first['episodes']} episodes, "
+        f"missing {first['missing_ratio']:.3f}: {', '.join(parts)}"
+    )
+
+
+def job(config: DictConfig) -> int:
     """Run one job of the command line.
 
     Args:
@@ -32,18 +281,17 @@ def train(config: DictConfig) -> int:
     Returns:
         The exit status.
     """
-    job = HydraConfig.get()
-    folder = Path(job.runtime.output_dir)
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    if plain["resume"] is not None:
-        plain = resumed_config(plain, list(job.overrides.task), folder)
-    return run(plain, folder)
+    words, folder = command_line(), Path(HydraConfig.get().runtime.output_dir)
+    config = checked(config, words)
+    if config.resume is not None:
+        config = resumed_config(config, words, folder)
+    return train(config, folder)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="config")
 def main(config: DictConfig) -> None:
     """Start from the command line."""
-    status = run_or_explain(lambda: train(config))
+    status = explained(lambda: job(config))
     # Hydra makes the folder before any setting is looked at: leave none behind for a bad one.
     with contextlib.suppress(OSError):
         Path(HydraConfig.get().runtime.output_dir).rmdir()
@@ -52,4 +300,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

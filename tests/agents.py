@@ -43,10 +43,12 @@ class Agent:
     belief: TensorDictModuleBase
     actor: ProbabilisticActor
     critic: ValueOperator
+    norm: TensorDictModuleBase | None = None
 
     @property
     def policy(self) -> ProbabilisticTensorDictSequential:
-        return ProbabilisticTensorDictSequential(self.belief, *self.actor.module)
+        first = [] if self.norm is None else [self.norm]
+        return ProbabilisticTensorDictSequential(*first, self.belief, *self.actor.module)
 
     @property
     def value(self) -> TensorDictSequential:
@@ -85,6 +87,7 @@ def make_agent(
     dtype: torch.dtype = torch.float64,
     init_std: float = 2.0,
     actions: int = ACTION,
+    norm: TensorDictModuleBase | None = None,
 ) -> Agent:
     """Heads of fixed weights; a wide policy makes the poles fall soon."""
     with torch.random.fork_rng():
@@ -102,7 +105,7 @@ def make_agent(
             return_log_prob=True,
         )
         critic = ValueOperator(nn.Linear(feature_dim, 1, dtype=dtype), in_keys=[features])
-    return Agent(belief, actor, critic)
+    return Agent(belief, actor, critic, norm)
 
 
 def make_env(dtype: torch.dtype = torch.float64, seed: int = 0) -> TransformedEnv:

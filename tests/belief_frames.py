@@ -12,8 +12,6 @@ from torchrl.envs import Compose
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_primers_from_module
 
-FRAME_KEYS = ("observation", "observed", "previous_action", "is_init")
-
 
 class BeliefFrames:
     """What the contracts of belief modules share; no test is in here.
@@ -22,10 +20,17 @@ class BeliefFrames:
         tolerance32: how far one step at a time and whole sequences may differ in float32, as a
             share of the largest entry.
         tolerance64: the same in float64.
+        observation: where the modules read what arrived.
     """
+
+    observation: str = "observation"
 
     tolerance32: float = 1e-5
     tolerance64: float = 1e-10
+
+    @property
+    def frame_keys(self) -> tuple[str, ...]:
+        return (self.observation, "observed", "previous_action", "is_init")
 
     def make_frames(
         self, shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0
@@ -36,7 +41,7 @@ class BeliefFrames:
         observation = torch.randn(*shape, OBS, generator=g, dtype=dtype)
         return TensorDict(
             {
-                "observation": torch.where(observed, observation, 0.0),
+                self.observation: torch.where(observed, observation, 0.0),
                 "observed": observed,
                 "previous_action": torch.randn(*shape, ACTION, generator=g, dtype=dtype),
                 "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
@@ -92,7 +97,7 @@ class BeliefFrames:
     def as_sequence(self, module: TensorDictModuleBase, rollout: TensorDict) -> TensorDict:
         """Run over time from what a rollout stores, with what the module wrote left out."""
         with set_recurrent_mode(True):
-            return module(rollout.select(*FRAME_KEYS, *self.state_keys(module)))
+            return module(rollout.select(*self.frame_keys, *self.state_keys(module)))
 
     def written(self, module: TensorDictModuleBase) -> list[Any]:
         return [k for k in module.out_keys if not (isinstance(k, tuple) and k[0] == "next")]

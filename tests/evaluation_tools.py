@@ -11,16 +11,13 @@ import pytest
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from recipe_tools import ROOT, make_config  # isort: skip
+from recipe_tools import ROOT, run  # isort: skip
 
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
-import torch
 from evaluation.conditions import Condition, parse_condition
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
-from training.config import Settings
-from training.run import run as train
+from omegaconf import DictConfig, OmegaConf
 
 SMOKE = (
     "experiment=smoke",
@@ -33,8 +30,7 @@ SMOKE = (
 
 
 def trained_folder(folder: Path, *overrides: str) -> Path:
-    with torch.random.fork_rng(devices=[]):
-        assert train(make_config(*SMOKE, *overrides), folder) == 0
+    assert run(folder, *SMOKE, *overrides) == 0
     return folder
 
 
@@ -45,7 +41,7 @@ def configured(command: str = "evaluate", *overrides: str) -> dict[str, Any]:
     return {str(key): value for key, value in composed.items()}
 
 
-def parse(text: str, settings: Settings) -> Condition:
+def parse(text: str, settings: DictConfig) -> Condition:
     return parse_condition(text, settings, spike_std=5.0)
 
 

@@ -3,52 +3,91 @@
 from __future__ import annotations
 
 import csv
+import io
+import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
 if str(ROOT / "recipes") not in sys.path:
     sys.path.insert(0, str(ROOT / "recipes"))
 
+from omegaconf import DictConfig  # noqa: E402
+from training.config import composed_config  # noqa: E402
+from training.run_folder import resumed_config  # noqa: E402
+
 # Every belief module of the recipe, found on disk: a new one is tested without an edit here.
 BELIEFS = sorted(path.stem for path in (CONF / "belief").glob("*.yaml"))
 
 TIMES = ("steps_per_second", "wall_time")
+# A run of seconds with a fifth of its entries missing.
+SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.2")
 
 
-def make_config(*overrides: str) -> dict[str, Any]:
-    """Compose the configuration that a command line gives."""
-    OmegaConf.register_new_resolver("run_folder", lambda resume, new: resume or new, replace=True)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
-    assert isinstance(composed, dict)
-    return {str(key): value for key, value in composed.items()}
+def make_config(*overrides: str) -> DictConfig:
+    """Compose and check the configuration that a command line gives."""
+    return composed_config(overrides)
+
+
+def run(folder: Path, *overrides: str) -> int:
+    """Train as a command line does, and leave torch's generator alone."""
+    from ppo_drbpn import train
+
+    with torch.random.fork_rng(devices=[]):
+        return train(make_config(*overrides), folder)
+
+
+def resume(folder: Path, *overrides: str) -> int:
+    """Go on with a run as ``resume=<folder>`` does."""
+    from ppo_drbpn import train
+
+    config = resumed_config(make_config(*overrides), ["resume=x", *overrides], folder)
+    with torch.random.fork_rng(devices=[]):
+        return train(config, folder)
+
+
+def assembled(*overrides: str) -> tuple[Any, DictConfig]:
+    """Build the parts of a run, and return its configuration beside them."""
+    from ppo_drbpn import assemble
+
+    config = make_config(*overrides)
+    return assemble(config), config
 
 
 def make_folder(folder: Path, *overrides: str) -> Path:
     """Leave a run folder with a checkpoint after one rollout with two fifths of it missing."""
-    from training.checkpoint import save_checkpoint
-    from training.config import read_settings
-    from training.loop import assemble, train_rollout, training_state
-    from training.run_folder import write_config
-
-    smoke = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4")
-    config = make_config(*smoke, *overrides)
-    folder.mkdir()
-    with torch.random.fork_rng(devices=[]):
-        settings = read_settings(config)
-        training = assemble(settings)
-        train_rollout(training, settings)
-        save_checkpoint(folder, training.progress.frames, training_state(training), keep=1)
-    write_config(folder, config)
+    smoke = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4", "total_frames=128")
+    blind = ("evaluation.every_frames=0", "evaluation.final_episodes=0")
+    run(folder, *smoke, *blind, *overrides)
     return folder
+
+
+def saved(state: dict[str, Any]) -> Any:
+    """Return what a file gives back of a state."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def command(
+    recipe: str, *words: str, cwd: Path, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a recipe as a person does."""
+    return subprocess.run(
+        [sys.executable, str(ROOT / "recipes" / recipe), *words],
+        cwd=cwd,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
 
 
 def read_table(path: Path) -> list[dict[str, str]]:

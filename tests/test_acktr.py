@@ -14,17 +14,14 @@ import torch
 from tensordict import TensorDictBase
 
 pytest.importorskip("hydra")
-from recipe_tools import differences, make_config, read_table  # isort: skip
+from recipe_tools import assembled, differences, make_config, read_table, resume, run  # isort: skip
 
-from algorithms import build_algorithm
 from algorithms.acktr import ACKTR
+from ppo_drbpn import collect, train_rollout
 from training.checkpoint import last_checkpoint, load_checkpoint
-from training.config import read_settings
 from training.errors import UserError
-from training.loop import Training, assemble, make_agent, train_rollout
-from training.resume import resumed_config
-from training.rollout import add_advantages
-from training.run import run
+from training.ppo import add_advantages
+from training.state import Training
 
 SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.steps=3")
 
@@ -33,27 +30,26 @@ SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.s
 def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the smoke experiment once, to its end."""
     folder = tmp_path_factory.mktemp("run") / "smoke"
-    with torch.random.fork_rng(devices=[]):
-        assert run(make_config(*SMOKE), folder) == 0
+    assert run(folder, *SMOKE) == 0
     return folder
 
 
 def rollout_of(*overrides: str) -> tuple[Training, TensorDictBase]:
     """A freshly assembled training and its first rollout, with advantages."""
-    training = assemble(read_settings(make_config(*SMOKE, *overrides)))
+    training, _ = assembled(*SMOKE, *overrides)
     assert isinstance(training.algorithm, ACKTR)
-    data = training.collector.rollout()
+    data = collect(training)
     add_advantages(data, training.agent, training.gae)
     return training, data
 
 
 def test_the_settings_are_those_of_the_paper() -> None:
-    settings = read_settings(make_config("algo=acktr", "belief=none"))
-    assert (settings.loss.gamma, settings.loss.lmbda) == (0.99, 0.97)
-    assert settings.collector.frames == 2560
-    assert settings.algo["desired_kl"] == 0.002
+    config = make_config("algo=acktr", "belief=none")
+    assert (config.advantage.gamma, config.advantage.lmbda) == (0.99, 0.97)
+    assert config.collector.num_envs * config.collector.steps_per_env == 2560
+    assert config.algo.desired_kl == 0.002
     # what is given on the command line wins over what the entry sets in other groups
-    assert read_settings(make_config("algo=acktr", "loss.lmbda=0.9")).loss.lmbda == 0.9
+    assert make_config("algo=acktr", "advantage.lmbda=0.9").advantage.lmbda == 0.9
 
 
 def test_a_run_leaves_its_numbers_and_no_column_of_ppo(smoke: Path) -> None:
@@ -71,10 +67,10 @@ def test_a_stopped_run_goes_on_to_the_last_bit(smoke: Path, tmp_path: Path, beli
     whole, parts = smoke, tmp_path / "parts"
     if belief != "belief=none":
         whole = tmp_path / "whole"
-        run(make_config(*overrides), whole)
-    run(make_config(*overrides, "total_frames=256", "evaluation.final_episodes=0"), parts)
+        run(whole, *overrides)
+    run(parts, *overrides, "total_frames=256", "evaluation.final_episodes=0")
     words = ["total_frames=512", "evaluation.final_episodes=3"]
-    assert run(resumed_config(make_config(*words), ["resume=x", *words], parts), parts) == 0
+    assert resume(parts, *words) == 0
     for table in ("metrics.csv", "episodes.csv"):
         assert read_table(whole / table) == read_table(parts / table), table
     states = [load_checkpoint(last_checkpoint(folder)) for folder in (whole, parts)]
@@ -125,9 +121,8 @@ def test_the_step_size_follows_the_divergence(desired: float, factor: float) -> 
 
 
 def test_the_divergence_comes_to_the_one_asked_for() -> None:
-    settings = read_settings(make_config(*SMOKE, "algo.policy.momentum=0.5"))
-    training = assemble(settings)
-    kls = [train_rollout(training, settings)[0]["kl"] for _ in range(40)]
+    training, config = assembled(*SMOKE, "algo.policy.momentum=0.5")
+    kls = [train_rollout(training, config)[0]["kl"] for _ in range(40)]
     assert 0.001 < sum(kls[20:]) / 20 < 0.004
 
 
@@ -140,23 +135,21 @@ def test_the_generator_of_the_whole_process_is_left_alone() -> None:
 
 @pytest.mark.parametrize("belief", ["drbpn", "gru", "transformer"])
 def test_a_belief_with_weights_of_its_own_is_refused(belief: str) -> None:
-    settings = read_settings(make_config("algo=acktr", f"belief={belief}", "env=inverted_pendulum"))
-    with pytest.raises(UserError, match=rf"`algo=acktr` must have a belief.* got belief={belief}"):
-        build_algorithm(settings, make_agent(settings)[1])
+    with pytest.raises(UserError, match=r"`algo=acktr` must have a belief module without weights"):
+        assembled("algo=acktr", f"belief={belief}", "env=inverted_pendulum")
 
 
 @pytest.mark.parametrize(
     ("override", "line"),
     [
-        ("algo._target_=nowhere.build", "`algo._target_` must name a builder such as"),
-        ("+algo.colour=red", "`algo=acktr`: .*colour"),
-        ("algo.desired_kl=0", "`algo=acktr`: `desired_kl` must be positive"),
-        ("algo.policy.damping=0", "`algo=acktr`: `damping` must be positive, got 0"),
-        ("algo.critic.momentum=1", r"`algo=acktr`: `momentum` must lie in \[0, 1\)"),
+        ("algo._target_=nowhere.build", "`algo`: Error loading 'nowhere.build'"),
+        ("+algo.colour=red", "`algo`: .*colour"),
+        ("algo.desired_kl=0", "`algo`: `desired_kl` must be positive"),
+        ("algo.policy.damping=0", "`algo`: `damping` must be positive, got 0"),
+        ("algo.critic.momentum=1", r"`algo`: `momentum` must lie in \[0, 1\)"),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(override: str, line: str) -> None:
-    settings = read_settings(make_config(*SMOKE, override))
     with pytest.raises(UserError, match=line) as error:
-        build_algorithm(settings, make_agent(settings)[1])
+        assembled(*SMOKE, override)
     assert "\n" not in str(error.value)

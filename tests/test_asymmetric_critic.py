@@ -11,16 +11,21 @@ import functools
 from pathlib import Path
 
 import pytest
-import recipe_tools
 import torch
-from contracts import saved
-from recipe_tools import BELIEFS, differences, make_config
-from tensordict import TensorDictBase
-from torchrl.envs import TransformedEnv
+from ppo_drbpn import collect, train_rollout
+from recipe_tools import (
+    BELIEFS,
+    assembled,
+    differences,
+    make_config,
+    read_table,
+    run,
+    saved,
+)
+from training.envs import make_env
+from training.ppo import add_advantages, to_sequences
 
-from torchrl_drbpn import MaskedObservationNorm
-
-COMPLETE = "complete_observation"
+COMPLETE = "normalized_complete_observation"
 SMOKE = ("experiment=smoke", "heads.critic_input=complete")
 CORRUPTION = {
     "noise and gaps": ("missingness=mcar", "missingness.eta=0.5", "noise.sigma=10"),
@@ -31,81 +36,63 @@ CORRUPTION = {
 }
 
 
-def assemble(*overrides: str):
-    from training.config import read_settings
-    from training.loop import assemble as assembled
-
-    settings = read_settings(make_config(*SMOKE, *overrides))
-    return assembled(settings), settings
-
-
 @functools.cache
 def rollout(belief: str):
     """Return a training and its second rollout: rows begin in mid-episode, and episodes end."""
     with torch.random.fork_rng():
-        training, _ = assemble(f"belief={belief}", "missingness=mcar", "missingness.eta=0.5")
-        training.collector.rollout()
-        data = training.collector.rollout().clone()
+        gaps = ("missingness=mcar", "missingness.eta=0.5")
+        training, _ = assembled(*SMOKE, f"belief={belief}", *gaps)
+        training.agent.norm.update(collect(training))
+        collect(training)
+        data = collect(training).clone()
     assert data["next", "done"][:, :-1].any()
     return training, data
 
 
 def with_advantages(belief: str):
-    from training.rollout import add_advantages
-
     training, data = rollout(belief)
     data = data.clone()
-    add_advantages(data, training.agent, training.algorithm.gae)
+    add_advantages(data, training.agent, training.gae)
     return training, data
 
 
 # ------------------------------------------------------------------------------ what it is shown
-def raw(env: TransformedEnv, data: TensorDictBase, key: str) -> torch.Tensor:
-    (norm,) = (t for t in env.transform if isinstance(t, MaskedObservationNorm))
-    return norm.denormalize(data[key])
-
-
 @pytest.mark.parametrize("corruption", CORRUPTION.values(), ids=CORRUPTION)
 def test_the_complete_observation_is_what_complete_noiseless_sensors_show(corruption):
-    from training.config import read_settings
-    from training.envs import make_environment
-
-    def make(*overrides, complete):
-        s = read_settings(make_config(*SMOKE, *overrides))
-        return make_environment(
-            s.env,
-            s.missingness,
-            s.noise,
-            s.normalisation,
-            num_envs=64,
-            num_threads=1,
-            gamma=s.loss.gamma,
-            seed=3,
-            complete=complete,
-        )
-
-    env = make(*corruption, complete=True)
-    clean = make(*CORRUPTION["nothing"], complete=False)
+    env = make_env(make_config(*SMOKE, *corruption), num_envs=64, seed=3)
+    nothing = make_config(*SMOKE, *CORRUPTION["nothing"])
+    clean = make_env(nothing, num_envs=64, seed=3, complete=False)
     data, expected = env.reset(), clean.reset()
-    assert COMPLETE not in expected
+    assert "complete_observation" not in expected
     for _ in range(2):
-        # float32 through two normalisations of different statistics
-        shown, truth = raw(env, data, COMPLETE), raw(clean, expected, "observation")
-        torch.testing.assert_close(shown, truth, rtol=1e-4, atol=1e-6)
+        shown = data["complete_observation"]
+        assert torch.equal(shown, expected["observation"])
         corrupted = corruption != CORRUPTION["nothing"]
-        assert torch.equal(data[COMPLETE], data["observation"]) is not corrupted
+        assert torch.equal(shown, data["observation"]) is not corrupted
         action = torch.full_like(data["previous_action"], 0.5)
         data = env.step(data.set("action", action))["next"]
         expected = clean.step(expected.set("action", action))["next"]
 
 
-def test_by_default_nothing_complete_is_written():
-    from training.config import read_settings
-    from training.loop import assemble as assembled
+def test_it_is_scaled_as_the_observations_are_and_not_learned_from():
+    training, data = rollout("none")
+    norm = training.agent.norm
+    raw = data["complete_observation"]
+    torch.testing.assert_close(data[COMPLETE], norm.normalize(raw))
+    before = norm.mean.clone()
+    data = data.clone()
+    data["complete_observation"] += 100.0
+    norm.update(data)
+    other = norm.mean.clone()
+    norm.mean.copy_(before)
+    assert (other - before).abs().max() < 1.0
 
+
+def test_by_default_nothing_complete_is_written():
     with torch.random.fork_rng():
-        training = assembled(read_settings(make_config("experiment=smoke")))
-    assert COMPLETE not in training.env.full_observation_spec.keys(True, True)
+        training, _ = assembled("experiment=smoke")
+    keys = training.env.full_observation_spec.keys(True, True)
+    assert "complete_observation" not in keys
     assert training.agent.critic.in_keys == ["features"]
 
 
@@ -116,8 +103,9 @@ def test_the_critic_reads_it_and_the_policy_does_not(belief):
     assert COMPLETE in training.algorithm.loss.in_keys
     step = data[:, 5].select(*training.agent.policy.in_keys)
     assert COMPLETE not in step
-    for part in (training.agent.policy, training.agent.actor, training.agent.belief):
+    for part in (training.agent.actor, training.agent.belief):
         assert COMPLETE not in part.in_keys
+    step = step.exclude("complete_observation")
     blind = step.clone().set(COMPLETE, torch.full_like(data[COMPLETE][:, 5], torch.nan))
     expected, received = training.agent.policy(step), training.agent.policy(blind)
     for key in ("features", "loc", "scale"):
@@ -127,8 +115,6 @@ def test_the_critic_reads_it_and_the_policy_does_not(belief):
 
 @pytest.mark.parametrize("belief", BELIEFS)
 def test_the_values_of_the_advantages_are_those_of_the_complete_observations(belief):
-    from training.rollout import recompute_advantages
-
     training, data = with_advantages(belief)
     critic = training.agent.critic.module
     with torch.no_grad():
@@ -140,7 +126,7 @@ def test_the_values_of_the_advantages_are_those_of_the_complete_observations(bel
     torch.testing.assert_close(following[goes_on], stored[goes_on], rtol=1e-4, atol=1e-4)
     # advantages that are recomputed in later epochs see it too
     again = data.clone()
-    recompute_advantages(again, training.agent, training.algorithm.gae)
+    add_advantages(again, training.agent, training.gae, recompute=True)
     for key in ("state_value", ("next", "state_value"), "advantage"):
         torch.testing.assert_close(again[key], data[key], rtol=1e-3, atol=1e-4)
     # and it reads the next complete observation where the episode ends or the rollout is cut
@@ -152,9 +138,6 @@ def test_the_values_of_the_advantages_are_those_of_the_complete_observations(bel
 
 @pytest.mark.parametrize("belief", BELIEFS)
 def test_every_belief_trains_with_it(belief):
-    from training.loop import train_rollout
-    from training.rollout import to_sequences
-
     training, data = with_advantages(belief)
     out = training.algorithm.loss(to_sequences(data, training.algorithm.loss, 16))
     assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
@@ -162,9 +145,9 @@ def test_every_belief_trains_with_it(belief):
     (grad,) = torch.autograd.grad(out["loss_critic"], first.weight, retain_graph=True)
     assert grad[:, -data[COMPLETE].shape[-1] :].abs().min() > 0
     with torch.random.fork_rng():
-        training, settings = assemble(f"belief={belief}")
+        training, config = assembled(*SMOKE, f"belief={belief}")
         before = [p.clone() for p in training.agent.critic.parameters()]
-        row, _ = train_rollout(training, settings)
+        row, _ = train_rollout(training, config)
     values = [value for value in row.values() if isinstance(value, float)]
     assert torch.tensor(values).isfinite().all()
     after = training.agent.critic.parameters()
@@ -173,33 +156,28 @@ def test_every_belief_trains_with_it(belief):
 
 # ------------------------------------------------------------------------------ files
 def test_a_stopped_run_goes_on_to_the_last_bit():
-    from training.loop import restore, train_rollout, training_state
-
     with torch.random.fork_rng():
-        whole, settings = assemble()
-        train_rollout(whole, settings)
-        state = saved(training_state(whole))
-        train_rollout(whole, settings)
-        expected = saved(training_state(whole))
-        resumed, _ = assemble()
-        restore(resumed, state, "here")
-        train_rollout(resumed, settings)
-        received = saved(training_state(resumed))
-    assert COMPLETE in state["carrier"]
+        whole, config = assembled(*SMOKE)
+        train_rollout(whole, config)
+        state = saved(whole.state_dict())
+        train_rollout(whole, config)
+        expected = saved(whole.state_dict())
+        resumed, _ = assembled(*SMOKE)
+        resumed.load_state_dict(state, "here")
+        train_rollout(resumed, config)
+        received = saved(resumed.state_dict())
+    assert "complete_observation" in state["carrier"]
     assert differences(expected, received) == []
 
 
 def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path: Path):
-    from evaluation.episodes import evaluate
     from evaluation.trained import load_trained_agent
-    from training.run import run
 
-    with torch.random.fork_rng():
-        assert run(make_config(*SMOKE, "total_frames=128"), tmp_path / "run") == 0
-        trained = load_trained_agent(tmp_path / "run")
-    make_env = trained.environments()
-    assert COMPLETE not in make_env(0).reset()
-    result = evaluate(trained.agent.policy, make_env, episodes=2, mode="mean", seed=0)
-    assert result is not None
-    table = recipe_tools.read_table(tmp_path / "run" / "evaluation.csv")
+    assert run(tmp_path / "run", *SMOKE, "total_frames=128") == 0
+    trained = load_trained_agent(tmp_path / "run")
+    env = trained.environments()(0)
+    root = env.reset()
+    assert "complete_observation" not in root
+    assert trained.agent.policy(root)["action"].isfinite().all()
+    table = read_table(tmp_path / "run" / "evaluation.csv")
     assert {row["kind"] for row in table} == {"final"}

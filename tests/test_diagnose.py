@@ -265,7 +265,7 @@ def test_an_observing_belief_acts_as_the_trained_one(
     agents: dict[str, TrainedAgent], name: str
 ) -> None:
     trained = agents[name]
-    make = trained.belief.observing
+    make = trained.agent.observing
     if make is None:
         assert name == "none"
         return
@@ -288,8 +288,8 @@ def test_a_forecast_gives_what_arrived_the_likelihood_that_the_belief_reports(
     agents: dict[str, TrainedAgent], name: str
 ) -> None:
     trained = agents[name]
-    assert trained.belief.observing is not None
-    observing = trained.belief.observing()
+    assert trained.agent.observing is not None
+    observing = trained.agent.observing()
     env = trained.environments()(0)
     with torch.no_grad():
         data = env.reset()
@@ -342,8 +342,8 @@ def test_the_truth_is_before_the_noise_and_readings_are_after_it(
     sums = tally_of(trained).errors["last value", "arrived"]
     rmse = (sums["squared"].sum() / sums["count"].sum()).sqrt().item()
     assert noise > 0
-    (norm,) = [t for t in trained.statistics.transform if hasattr(t, "denormalize")]
-    expected = (noise / norm.scale).square().mean().sqrt().item()
+    norm = trained.agent.norm
+    expected = (noise / norm.std).square().mean().sqrt().item()
     assert rmse == pytest.approx(expected, rel=0.5)
 
 

@@ -22,9 +22,9 @@ import diagnose as diagnose_recipe
 from analysis.calibration import diagnose
 from evaluation.table import Protocol, evaluate_condition
 from evaluation.trained import TrainedAgent, load_trained_agent
+from omegaconf import DictConfig
 from recipe_tools import make_config
-from training.config import Settings, read_settings
-from training.console import run_or_explain
+from training.config import explained
 from training.errors import UserError
 
 from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
@@ -36,8 +36,8 @@ def drbpn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def settings() -> Settings:
-    return read_settings(make_config(*SMOKE))
+def settings() -> DictConfig:
+    return make_config(*SMOKE)
 
 
 def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
@@ -50,7 +50,7 @@ def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
 def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
-    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, value: float
+    drbpn: Path, settings: DictConfig, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
     point = parse("mcar:0.5", settings)
     trained, protocol = load_trained_agent(drbpn), Protocol(3, 1, 0, 1, None)
@@ -87,7 +87,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
 
 @pytest.mark.parametrize("command", ["evaluate", "diagnose"])
 def test_the_belief_of_an_episode_that_is_over_goes_no_further(
-    drbpn: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, command: str
+    drbpn: Path, settings: DictConfig, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     """Fed its last observation for ever it may diverge, and stop an evaluation of others."""
     step, means, resets = BeliefFilter.step, [], []
@@ -164,5 +164,5 @@ def test_an_error_of_the_filter_is_one_line_of_every_command(
     def job() -> int:
         raise BeliefDivergedError("the belief is no longer finite")
 
-    assert run_or_explain(job) == 2
+    assert explained(job) == 2
     assert capsys.readouterr().err == "error: the belief is no longer finite\n"

@@ -111,8 +111,10 @@ def test_the_observation_covariance_is_that_of_a_step_inside_an_episode(
 def test_spikes_count_as_noise_that_was_added(agents: list[TrainedAgent]) -> None:
     """A spike of deviation tau that hits with probability p adds p tau^2 to the variance."""
     quiet, settings = learned_sensors(agents[0]).added_std, agents[0].settings
-    noise = replace(settings.noise, spike_probability=0.25, spike_std=0.02 * 3**0.5)
-    spiky = learned_sensors(replace(agents[0], settings=replace(settings, noise=noise))).added_std
+    spikes = {"spike_probability": 0.25, "spike_std": 0.02 * 3**0.5}
+    noisy = settings.copy()
+    noisy.noise = {**settings.noise, **spikes}
+    spiky = learned_sensors(replace(agents[0], settings=noisy)).added_std
     torch.testing.assert_close(spiky, 2 * quiet)
 
 

@@ -2,19 +2,16 @@
 
 A run leaves a whole folder. One seed gives one result, and a run that was stopped, by a signal or
 by the machine, goes on as if it never had been, to the last bit. An evaluation changes nothing in
-the training. The agent read back from its folder acts as the one that was saved. A folder or a
-checkpoint that can't be used is answered with one line.
+the training. A folder that can't be used is answered with one line, and what is in it stays.
 """
 
 from __future__ import annotations
 
-import io
+import fcntl
 import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -24,34 +21,33 @@ import pytest
 import torch
 
 pytest.importorskip("hydra")
-from recipe_tools import ROOT, differences, make_config, read_table  # isort: skip
+from recipe_tools import (  # isort: skip
+    SMOKE,
+    assembled,
+    command,
+    differences,
+    make_config,
+    read_table,
+    resume,
+    run,
+    saved,
+)
 
-from evaluation.episodes import evaluate, make_evaluation_environment
-from evaluation.trained import load_trained_agent
-from training import run_folder
+from ppo_drbpn import train_rollout
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
-from training.config import read_settings
-from training.errors import UserError
-from training.loop import assemble, restore, train_rollout, training_state
-from training.resume import resumed_config
-from training.run import run
+from training.errors import DivergedError, UserError
+from training.evaluation import evaluate_training
 from training.run_folder import Table, read_config
 
-SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.2")
+TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 
 
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the smoke experiment once, to its end."""
     folder = tmp_path_factory.mktemp("run") / "smoke"
-    with torch.random.fork_rng(devices=[]):
-        assert run(make_config(*SMOKE), folder) == 0
+    assert run(folder, *SMOKE) == 0
     return folder
-
-
-def resume(folder: Path, *overrides: str) -> int:
-    config = resumed_config(make_config(*overrides), ["resume=x", *overrides], folder)
-    return run(config, folder)
 
 
 def copied(smoke: Path, tmp_path: Path) -> Path:
@@ -59,7 +55,7 @@ def copied(smoke: Path, tmp_path: Path) -> Path:
 
 
 def assert_same_run(first: Path, second: Path) -> None:
-    for table in ("metrics.csv", "episodes.csv", "evaluation.csv"):
+    for table in TABLES:
         assert read_table(first / table) == read_table(second / table), table
     states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
     assert differences(*states) == []
@@ -78,7 +74,7 @@ def test_a_run_leaves_configuration_tables_checkpoints_and_versions(smoke: Path)
     assert float(metrics[-1]["missing_ratio"]) == pytest.approx(0.2, abs=0.07)
     kinds = [(row["kind"], row["mode"]) for row in read_table(smoke / "evaluation.csv")]
     assert kinds == [(k, m) for k in ("training", "final") for m in ("sampled", "mean")]
-    assert len(list((smoke / "checkpoints").iterdir())) == 2
+    assert len(list((smoke / "checkpoints").glob("*.pt"))) == 2
     versions = json.loads((smoke / "versions.json").read_text())
     assert {"python", "torch", "torchrl", "gymnasium", "mujoco", "git_commit"} < versions.keys()
     assert list((smoke / "logs").rglob("*.csv"))
@@ -95,50 +91,56 @@ def test_each_finished_episode_is_a_row_with_its_raw_return(smoke: Path) -> None
 
 def test_the_tensorboard_logger_writes_its_file(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
-    run(make_config(*SMOKE, "logger=tensorboard", "total_frames=128"), tmp_path / "run")
+    run(tmp_path / "run", *SMOKE, "logger=tensorboard", "total_frames=128")
     assert list((tmp_path / "run" / "logs").glob("events.out*"))
+
+
+def test_the_statistics_are_constant_while_a_rollout_is_collected_and_learned_from() -> None:
+    training, config = assembled(*SMOKE)
+    train_rollout(training, config)
+    counts = []
+    update = training.algorithm.update
+
+    def watched(data: Any, remaining: float) -> dict[str, float]:
+        counts.append(training.agent.norm.count.clone())
+        # What the policy stored is what the loss reads, to the bit.
+        again = training.agent.norm(data.select("observation", "observed"))
+        assert torch.equal(again["normalized_observation"], data["normalized_observation"])
+        row = update(data, remaining)
+        assert torch.equal(training.agent.norm.count, counts[-1])
+        return row
+
+    training.algorithm.update = watched
+    train_rollout(training, config)
+    assert (training.agent.norm.count > counts[-1]).all()
 
 
 # One seed, one result -------------------------------------------------------------------------
 
 
 def test_one_seed_gives_one_result_and_another_seed_another(smoke: Path, tmp_path: Path) -> None:
-    run(make_config(*SMOKE), tmp_path / "again")
+    run(tmp_path / "again", *SMOKE)
     assert_same_run(smoke, tmp_path / "again")
-    run(make_config(*SMOKE, "seed=1"), tmp_path / "other")
-    assert read_table(smoke / "metrics.csv") != read_table(tmp_path / "other" / "metrics.csv")
+    run(tmp_path / "other", *SMOKE, "seed=1", "total_frames=128")
+    other = read_table(tmp_path / "other" / "metrics.csv")
+    assert read_table(smoke / "metrics.csv")[:1] != other
 
 
 def test_evaluation_changes_nothing_in_the_training(smoke: Path, tmp_path: Path) -> None:
     off = ("evaluation.every_frames=0", "evaluation.final_episodes=0")
-    run(make_config(*SMOKE, *off), tmp_path / "blind")
+    run(tmp_path / "blind", *SMOKE, *off)
     assert read_table(smoke / "metrics.csv") == read_table(tmp_path / "blind" / "metrics.csv")
 
 
-def test_evaluation_leaves_the_global_generator_and_the_statistics_alone() -> None:
-    settings = read_settings(make_config(*SMOKE))
-    training = assemble(settings)
-    train_rollout(training, settings)
-    before = _copy(training_state(training))
-
-    def make_env(_: int) -> Any:
-        return make_evaluation_environment(
-            settings, training.belief, training.agent, statistics=training.env
-        )
-
-    policy, how = training.agent.policy, {"episodes": 3, "seed": 5}
-    result = evaluate(policy, make_env, mode="sampled", **how)
-    assert result is not None
-    assert len(result.returns) == len(result.lengths) == 3
-    assert evaluate(policy, make_env, mode="mean", **how, stop=lambda: True) is None
-    assert differences(before, _copy(training_state(training))) == []
-
-
-def _copy(state: dict[str, Any]) -> Any:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
+def test_evaluation_leaves_the_whole_training_alone() -> None:
+    training, config = assembled(*SMOKE)
+    train_rollout(training, config)
+    before = saved(training.state_dict())
+    rows = evaluate_training(config, training, "training", 3, lambda: False)
+    assert rows is not None
+    assert [row["episodes"] for row in rows] == [3, 3]
+    assert evaluate_training(config, training, "training", 3, lambda: True) is None
+    assert differences(before, saved(training.state_dict())) == []
 
 
 # Stopped and resumed --------------------------------------------------------------------------
@@ -157,12 +159,12 @@ def test_a_resumed_run_equals_one_that_never_stopped(
     overrides: tuple[str, ...], tmp_path: Path
 ) -> None:
     straight = tmp_path / "straight"
-    run(make_config("experiment=smoke", *overrides), straight)
+    run(straight, "experiment=smoke", *overrides)
     broken = shutil.copytree(straight, tmp_path / "broken")
     # The machine stopped after the second rollout's checkpoint, in the middle of a later row.
     last_checkpoint(broken).unlink()
     assert last_checkpoint(broken).name == "frames_000000000256.pt"
-    for table in ("metrics.csv", "episodes.csv", "evaluation.csv"):
+    for table in TABLES:
         with (broken / table).open("a") as file:
             file.write("640,1.")
     assert resume(broken) == 0
@@ -170,9 +172,9 @@ def test_a_resumed_run_equals_one_that_never_stopped(
 
 
 def test_a_signal_saves_and_the_resumed_run_equals_one_that_never_stopped(tmp_path: Path) -> None:
-    longer = (*SMOKE, "total_frames=4096", "evaluation.every_frames=1024")
+    longer = (*SMOKE, "total_frames=2048", "evaluation.every_frames=1024")
     straight, stopped = tmp_path / "straight", tmp_path / "stopped"
-    run(make_config(*longer), straight)
+    run(straight, *longer)
 
     def stop() -> None:
         metrics = stopped / "metrics.csv"
@@ -183,12 +185,12 @@ def test_a_signal_saves_and_the_resumed_run_equals_one_that_never_stopped(tmp_pa
     handler = signal.getsignal(signal.SIGTERM)
     killer = threading.Thread(target=stop)
     killer.start()
-    status = run(make_config(*longer), stopped)
+    status = run(stopped, *longer)
     killer.join()
     assert status == 128 + signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) is handler
     rows = read_table(stopped / "metrics.csv")
-    assert 3 <= len(rows) < 32
+    assert 3 <= len(rows) < 16
     assert load_checkpoint(last_checkpoint(stopped))["progress"]["frames"] == len(rows) * 128
     assert resume(stopped) == 0
     assert_same_run(straight, stopped)
@@ -205,82 +207,76 @@ def test_an_evaluation_that_was_cut_short_is_made_again(smoke: Path, tmp_path: P
     assert_same_run(smoke, folder)
 
 
-def test_resuming_a_finished_run_changes_nothing(smoke: Path, tmp_path: Path) -> None:
+def test_resuming_a_finished_run_says_so_and_changes_nothing(
+    smoke: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = copied(smoke, tmp_path)
+    assert resume(folder) == 0
+    assert "is at its end" in capsys.readouterr().out
+    assert_same_run(smoke, folder)
+
+
+def test_a_run_that_lacks_its_final_evaluation_gets_it(smoke: Path, tmp_path: Path) -> None:
+    folder = copied(smoke, tmp_path)
+    table = folder / "evaluation.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
     assert resume(folder) == 0
     assert_same_run(smoke, folder)
 
 
-def test_more_frames_can_be_added_to_a_finished_run(smoke: Path, tmp_path: Path) -> None:
+def test_more_frames_can_be_added_to_a_finished_run_and_none_taken_away(
+    smoke: Path, tmp_path: Path
+) -> None:
     folder = copied(smoke, tmp_path)
     assert resume(folder, "total_frames=768") == 0
     rows = read_table(folder / "metrics.csv")
     assert [int(row["frames"]) for row in rows] == [128, 256, 384, 512, 640, 768]
     assert float(rows[-1]["lr"]) == pytest.approx(1e-3 * (1 - 640 / 768))
+    before = (folder / "config.yaml").read_text()
+    with pytest.raises(UserError, match=r"`total_frames` must be at least the 768 .* got 256"):
+        resume(folder, "total_frames=256")
+    assert (folder / "config.yaml").read_text() == before
 
 
-# Folders and checkpoints that can't be used ----------------------------------------------------
+# Folders that can't be used -------------------------------------------------------------------
 
 
-def test_a_truncated_checkpoint_is_named_and_nothing_is_lost(smoke: Path, tmp_path: Path) -> None:
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_second_run_into_a_folder_is_refused_and_the_first_one_stays(smoke: Path) -> None:
+    before = contents(smoke)
+    with pytest.raises(UserError, match=r"holds a run already: .*resume="):
+        run(smoke, *SMOKE, "seed=1")
+    assert contents(smoke) == before
+
+
+def test_two_runs_in_one_folder_at_once_are_refused(smoke: Path, tmp_path: Path) -> None:
     folder = copied(smoke, tmp_path)
-    path = last_checkpoint(folder)
-    path.write_bytes(path.read_bytes()[:-1000])
-    before = (folder / "metrics.csv").read_text()
-    with pytest.raises(UserError, match=r"frames_000000000512.pt` can't be read: .*truncated"):
-        resume(folder)
-    assert (folder / "metrics.csv").read_text() == before
-    path.unlink()
-    assert resume(folder) == 0
-    assert_same_run(smoke, folder)
+    with (folder / ".lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(UserError, match="is in use by a run that has not ended"):
+            resume(folder, "total_frames=768")
+    assert len(read_table(folder / "metrics.csv")) == 4
+    assert resume(folder, "total_frames=640") == 0
 
 
-def test_a_foreign_file_is_no_checkpoint(smoke: Path, tmp_path: Path) -> None:
-    folder = copied(smoke, tmp_path)
-    torch.save({"weights": torch.zeros(3)}, last_checkpoint(folder))
-    with pytest.raises(UserError, match="is not a checkpoint of this recipe"):
-        resume(folder)
-    last_checkpoint(folder).write_text("hello")
-    with pytest.raises(UserError, match="truncated or no checkpoint"):
-        resume(folder)
+def test_a_file_where_a_folder_should_be_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("hello")
+    with pytest.raises(UserError, match="can't be a run folder: "):
+        run(tmp_path / "run" / "below", *SMOKE)
 
 
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [("env", {"id": "Hopper", "name": "hopper", "version": "v5", "backend": "gymnasium"}),
-     ("collector", {"num_envs": 8, "steps_per_env": 32, "num_threads": 1}),
-     ("heads", None)],
-    ids=["another-task", "another-number-of-environments", "other-heads"],
-)  # fmt: skip
-def test_a_checkpoint_of_another_shape_is_refused(
-    smoke: Path, tmp_path: Path, setting: str, value: Any
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"", b"fram\n1\n"], ids=repr)
+def test_a_damaged_table_is_named_and_stays_as_it_is(
+    smoke: Path, tmp_path: Path, content: bytes
 ) -> None:
-    config = read_config(smoke)
-    config[setting] = value or config["heads"] | {"hidden": [32, 32]}
-    settings = read_settings(config)
-    state = load_checkpoint(last_checkpoint(smoke))
-    with pytest.raises(UserError, match="does not fit the settings of this run") as error:
-        restore(assemble(settings), state, "there")
-    assert "\n" not in str(error.value)
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"must be a run folder with config.yaml"):
-        resume(tmp_path)
-    with pytest.raises(UserError, match="holds no checkpoint"):
-        last_checkpoint(tmp_path)
-
-
-def test_a_checkpoint_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    save_checkpoint(tmp_path, 1, {"value": 1}, keep=2)
-
-    class Unwritable:
-        def __reduce__(self) -> Any:
-            raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        save_checkpoint(tmp_path, 2, {"value": Unwritable()}, keep=2)
-    assert load_checkpoint(last_checkpoint(tmp_path))["value"] == 1
+    folder = copied(smoke, tmp_path)
+    (folder / "metrics.csv").write_bytes(content)
+    with pytest.raises(UserError, match=r"metrics.csv` (can't be read|must begin).*damaged"):
+        resume(folder, "total_frames=640")
+    assert (folder / "metrics.csv").read_bytes() == content
 
 
 def test_a_table_drops_what_was_written_after_the_checkpoint(tmp_path: Path) -> None:
@@ -291,75 +287,161 @@ def test_a_table_drops_what_was_written_after_the_checkpoint(tmp_path: Path) -> 
     assert path.read_text() == "frames,value,new\n1,,\n"
 
 
-# Evaluation of a trained agent -----------------------------------------------------------------
+def test_a_run_folder_of_the_first_version_is_refused_by_the_commit_that_reads_it(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "config.yaml").write_text("env:\n  name: hopper\n  backend: gymnasium\n")
+    with pytest.raises(UserError, match=r"version 0.1.0, which the code of commit 2ebd861 reads"):
+        read_config(tmp_path)
 
 
-def test_the_agent_read_back_repeats_the_final_evaluation(smoke: Path) -> None:
-    trained = load_trained_agent(smoke)
-    final = [row for row in read_table(smoke / "evaluation.csv") if row["kind"] == "final"]
-    for row in final:
-        result = evaluate(
-            trained.agent.policy,
-            trained.environments(),
-            episodes=3,
-            mode=row["mode"],
-            seed=trained.settings.evaluation.seed,
-        )
-        assert result is not None
-        assert result.mean_return == float(row["return_mean"])
-        assert result.missing_ratio == pytest.approx(float(row["missing_ratio"]))
-        assert result.log_likelihood == pytest.approx(float(row["log_likelihood"]))
+@pytest.mark.parametrize(
+    "overrides",
+    [("env=hopper",), ("collector.num_envs=8",), ("heads.hidden=[32,32]",)],
+    ids=["another-task", "another-number-of-environments", "other-heads"],
+)
+def test_a_checkpoint_of_another_shape_is_refused(smoke: Path, overrides: tuple[str, ...]) -> None:
+    state = load_checkpoint(last_checkpoint(smoke))
+    training, _ = assembled(*SMOKE, *overrides)
+    with pytest.raises(UserError, match="does not fit the settings of this run") as error:
+        training.load_state_dict(state, "there")
+    assert "\n" not in str(error.value)
+
+
+# Numbers that are none ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("belief", ["drbpn", "gru", "none"])
+def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(
+    tmp_path: Path, belief: str
+) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(
+        UserError, match=r"training stopped at 0 steps: .*(nan|inf|no longer finite)"
+    ) as error:
+        run(folder, *SMOKE, f"belief={belief}", "optim.lr=1e30")
+    assert "\n" not in str(error.value)
+    assert "checkpoint" not in str(error.value)
+    assert not list(folder.rglob("*.pt"))
+    assert not read_table(folder / "evaluation.csv")
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        ("nan", "training stopped at 256 steps: the reward of environment 2 is not finite"),
+        ("raise", "training stopped at 256 steps: the environment failed: motor on fire"),
+    ],
+)
+def test_a_fault_of_the_environment_ends_in_one_line_and_a_saved_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, line: str
+) -> None:
+    import ppo_drbpn
+
+    collect, calls = ppo_drbpn.collect, []
+
+    def faulty(training: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 4:  # the first gives statistics alone
+            rollout = training.collector.rollout
+
+            def broken() -> Any:
+                if fault == "raise":
+                    raise RuntimeError("motor\non fire")
+                data = rollout()
+                data["next", "reward"][2, 5] = torch.nan
+                return data
+
+            monkeypatch.setattr(training.collector, "rollout", broken)
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", faulty)
+    folder = tmp_path / "run"
+    with pytest.raises(UserError, match=line):
+        run(folder, *SMOKE, "checkpoint.every_frames=10000")
+    assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
+    monkeypatch.undo()
+    assert resume(folder) == 0  # with new episodes
+    assert len(read_table(folder / "metrics.csv")) == 4
+
+
+def test_a_weight_that_is_none_is_named() -> None:
+    training, config = assembled(*SMOKE)
+    with torch.no_grad():
+        training.agent.critic.module[0].bias[3] = torch.inf
+    with pytest.raises(DivergedError, match=r"the (loss|weight|gradient) `.*` is (nan|inf)"):
+        train_rollout(training, config)
 
 
 # The command line ------------------------------------------------------------------------------
 
 
-def command(recipe: str, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(ROOT / "recipes" / recipe), *words],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-
-
-def test_the_commands_run_from_any_directory(tmp_path: Path) -> None:
-    done = command("ppo_drbpn.py", "experiment=smoke", "total_frames=128", cwd=tmp_path)
+def test_the_command_runs_from_any_directory(tmp_path: Path) -> None:
+    words = ("experiment=smoke", "total_frames=128", "evaluation.final_episodes=1")
+    done = command("ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "steps/s from the first collected frame to the last update" in done.stdout
+    assert "steps/s in collection and update" in done.stdout
     (folder,) = (tmp_path / "runs").iterdir()
-    assert folder.name.startswith("inverted_pendulum-v5-drbpn-seed0-")
+    assert folder.name.startswith("InvertedPendulum-v5-drbpn-seed0-")
     assert not set("=,") & set(folder.name)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
-    words = (
-        f"run={folder}",
-        "points=[none:0,mcar:.5]",
-        "episodes=2",
-        "output=out.csv",
-        "figures=false",
-    )
-    done = command("evaluate.py", *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert len(read_table(tmp_path / "out.csv")) == 2 * 2 * 2
 
 
-def test_a_bad_value_on_the_command_line_prints_one_line_and_leaves_no_folder(
-    tmp_path: Path,
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["missingness.eta=1.5"], "`missingness`: `eta` must be a missing rate in [0, 1], got 1.5"),
+        (["loss.modelcoeff=1"], "`loss.modelcoeff` is no setting: did you mean `loss.model_coeff`"),
+        (["env=wlaker2d"], "`env=wlaker2d` is no choice: did you mean `walker2d`?"),
+        (["env=gym"], "`env.id` must be given"),
+        (["resume=nowhere"], "nowhere` must be a run folder with config.yaml"),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(
+    tmp_path: Path, words: list[str], line: str
 ) -> None:
-    done = command("ppo_drbpn.py", "missingness.eta=1.5", cwd=tmp_path)
+    done = command("ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: `missingness.eta` must lie in [0, 1], got 1.5.\n"
-    assert not list(tmp_path.rglob("*seed*"))
+    assert done.stderr.startswith("error: ")
+    assert line in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.glob("runs/*"))
+    assert not done.stdout
 
 
-def test_a_run_folder_from_before_a_setting_was_added_stays_readable(
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_folder, "_LATER_SETTINGS", {"heads.width": 3, "heads.hidden": [1]})
-    (tmp_path / "config.yaml").write_text("heads:\n  hidden: [64, 64]\n")
+    from training.config import new_folder
 
-    config = read_config(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    names = [new_folder("Hopper-v5-drbpn-seed0") for _ in range(3)]
+    assert len(set(names)) == 3
+    assert all(Path(name).is_dir() for name in names)
 
-    assert config["heads"] == {"hidden": [64, 64], "width": 3}  # what was written is kept
+
+def test_a_closed_pipe_does_not_stop_a_run(tmp_path: Path) -> None:
+    import subprocess
+    import sys
+
+    from recipe_tools import ROOT
+
+    words = [*SMOKE, "total_frames=256", "hydra.run.dir=run", "evaluation.every_frames=0"]
+    job = subprocess.Popen(
+        [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), *words],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    assert job.stdout is not None
+    job.stdout.close()
+    assert job.wait(timeout=240) == 0
+    assert len(read_table(tmp_path / "run" / "metrics.csv")) == 2
+    assert last_checkpoint(tmp_path / "run").name == "frames_000000000256.pt"
+
+
+def test_the_configuration_of_a_run_is_what_it_was_composed_from(smoke: Path) -> None:
+    expected = make_config(*SMOKE)
+    from omegaconf import OmegaConf
+
+    assert read_config(smoke) == OmegaConf.to_container(expected, resolve=True)

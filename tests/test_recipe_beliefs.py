@@ -13,21 +13,17 @@ from importlib import import_module
 
 import pytest
 import torch
-from contracts import ACTION, OBS, RecipeBeliefContract, saved
+from contracts import ACTION, OBS, RecipeBeliefContract
 
 pytest.importorskip("hydra")
-from recipe_tools import BELIEFS, differences, make_config  # isort: skip
+from recipe_tools import BELIEFS, assembled, differences, make_config, saved  # isort: skip
 
-from beliefs import Belief, build_belief
-from training.config import read_settings
+from beliefs import Belief
+from omegaconf import DictConfig
+from ppo_drbpn import train_rollout
+from training.config import build
 from training.errors import UserError
-from training.loop import (
-    assemble,
-    metric_columns,
-    restore,
-    train_rollout,
-    training_state,
-)
+from training.run_folder import metric_columns
 
 # Choices inside a belief that change what it reads, writes or remembers.
 FURTHER = [
@@ -40,8 +36,8 @@ FURTHER = [
 
 
 @functools.cache
-def settings_of(name: str) -> dict:
-    return make_config(*f"belief={name}".split())["belief"]
+def settings_of(name: str) -> DictConfig:
+    return make_config(*f"belief={name}".split()).belief
 
 
 class TestEveryBelief(RecipeBeliefContract):
@@ -52,9 +48,7 @@ class TestEveryBelief(RecipeBeliefContract):
     def make_belief(self, obs: int = OBS, action: int = ACTION) -> Belief:
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            return build_belief(
-                settings_of(self.name), obs_dim=obs, action_dim=action, normalize="entry"
-            )
+            return build("belief", settings_of(self.name), obs_dim=obs, action_dim=action)
 
 
 def test_the_beliefs_on_disk_are_found():
@@ -68,28 +62,28 @@ def test_its_settings_stand_in_its_entry_and_none_in_the_code(belief):
     module, _, function = entry["_target_"].rpartition(".")
     parameters = inspect.signature(getattr(import_module(module), function)).parameters
     assert all(p.default is inspect.Parameter.empty for p in parameters.values())
-    given = {"obs_dim", "action_dim", "normalize"}
+    given = {"obs_dim", "action_dim"}
     assert set(parameters) - given == set(entry) - {"_target_", "name"}
-    with pytest.raises(UserError, match=f"`belief={belief}`: .*colour"):
-        build_belief({**entry, "colour": "red"}, obs_dim=3, action_dim=1, normalize="entry")
+    with pytest.raises(UserError, match=r"`belief`: .*colour"):
+        build("belief", {**entry, "colour": "red"}, obs_dim=3, action_dim=1)
 
 
 @pytest.mark.parametrize("belief", BELIEFS)
 def test_a_run_learns_and_goes_on_from_its_files_to_the_last_bit(belief):
-    settings = read_settings(make_config("experiment=smoke", f"belief={belief}"))
+    words = ("experiment=smoke", f"belief={belief}")
     with torch.random.fork_rng():
-        whole = assemble(settings)
+        whole, config = assembled(*words)
         start = [p.detach().clone() for p in whole.agent.parameters()]
-        train_rollout(whole, settings)
-        state = saved(training_state(whole))
-        row, _ = train_rollout(whole, settings)
-        expected = saved(training_state(whole))
-        resumed = assemble(settings)
-        restore(resumed, state, "here")
-        train_rollout(resumed, settings)
-        received = saved(training_state(resumed))
+        train_rollout(whole, config)
+        state = saved(whole.state_dict())
+        row, _ = train_rollout(whole, config)
+        expected = saved(whole.state_dict())
+        resumed, _ = assembled(*words)
+        resumed.load_state_dict(state, "here")
+        train_rollout(resumed, config)
+        received = saved(resumed.state_dict())
     assert differences(expected, received) == []
-    columns = metric_columns(whole)
+    columns = metric_columns(whole.agent.summary())
     assert len(set(columns)) == len(columns)
     assert row.keys() <= set(columns) | {"entropy", "max_ratio", "mean_ratio"}
     numbers = [value for value in row.values() if value is not None]

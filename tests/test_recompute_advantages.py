@@ -10,26 +10,20 @@ from __future__ import annotations
 
 import pytest
 import torch
-from recipe_tools import BELIEFS, make_config
+from recipe_tools import BELIEFS, assembled
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.5")
 
 
-def assemble(*overrides: str):
-    from training.config import read_settings
-    from training.loop import assemble as assembled
-
-    settings = read_settings(make_config(*SMOKE, *overrides))
-    return assembled(settings), settings
-
-
 def collected(*overrides: str):
-    from training.rollout import add_advantages
+    from ppo_drbpn import collect
+    from training.ppo import add_advantages
 
     with torch.random.fork_rng():
-        training, _ = assemble(*overrides)
-        training.collector.rollout()
-        data = training.collector.rollout().clone()
+        training, _ = assembled(*SMOKE, *overrides)
+        training.agent.norm.update(collect(training))
+        collect(training)
+        data = collect(training).clone()
     add_advantages(data, training.agent, training.gae)
     return training, data
 
@@ -43,23 +37,23 @@ def move_critic(training) -> None:
 # A particle filter draws anew at every pass: its beliefs are not repeated by a second step.
 @pytest.mark.parametrize("belief", [b for b in BELIEFS if b != "dvrl"])
 def test_the_parameters_that_collected_give_the_advantages_that_were_there(belief):
-    from training.rollout import recompute_advantages
+    from training.ppo import add_advantages
 
     training, data = collected(f"belief={belief}")
     before = data["advantage"].clone()
     with torch.random.fork_rng():
-        recompute_advantages(data, training.agent, training.gae)
+        add_advantages(data, training.agent, training.gae, recompute=True)
     torch.testing.assert_close(data["advantage"], before, rtol=1e-4, atol=1e-4)
 
 
 def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
     from torchrl.objectives.value import GAE
-    from training.rollout import recompute_advantages
+    from training.ppo import add_advantages
 
     training, data = collected("belief=none")
     stale = data["advantage"].clone()
     move_critic(training)
-    recompute_advantages(data, training.agent, training.gae)
+    add_advantages(data, training.agent, training.gae, recompute=True)
     gae = GAE(gamma=0.99, lmbda=0.95, value_network=training.agent.critic, shifted=False)
     gae.set_keys(reward="scaled_reward")
     expected = data.clone()
@@ -71,12 +65,12 @@ def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
 
 
 def losses(recompute: bool, epochs: int) -> dict[str, float]:
-    from training.loop import train_rollout
+    from ppo_drbpn import train_rollout
 
     with torch.random.fork_rng():
         flag = f"optim.recompute_advantages={str(recompute).lower()}"
-        training, settings = assemble(flag, f"optim.epochs={epochs}", "optim.lr=0.01")
-        row, _ = train_rollout(training, settings)
+        training, config = assembled(*SMOKE, flag, f"optim.epochs={epochs}", "optim.lr=0.01")
+        row, _ = train_rollout(training, config)
     return {key: row[key] for key in ("loss_critic", "loss_objective", "grad_norm")}
 
 
@@ -90,7 +84,7 @@ def test_a_belief_without_memory_learns_from_single_steps():
     lengths = {}
     for belief in ("none", "fill", "gru", "drbpn"):
         training, data = collected(f"belief={belief}", "optim.sequence_length=8")
-        lengths[belief] = next(training.algorithm.epochs(data)).shape[1]
+        lengths[belief] = next(training.algorithm.cut(data)).shape[1]
     assert lengths == {"none": 1, "fill": 1, "gru": 8, "drbpn": 8}
 
 
@@ -98,6 +92,6 @@ def test_the_last_step_of_every_environment_is_final_and_no_other():
     training, data = collected("optim.sequence_length=8")
     envs, time = data.shape
     assert time > 8  # cuts inside the rollout are among the others
-    final = next(training.algorithm.epochs(data))["final"].reshape(envs, time)
+    final = next(training.algorithm.cut(data))["final"].reshape(envs, time)
     assert final[:, -1].all()
     assert not final[:, :-1].any()

@@ -21,10 +21,11 @@ pytest.importorskip("matplotlib")
 from recipe_tools import BELIEFS, ROOT, make_config  # isort: skip
 
 from analysis.figures import draw_evaluation, episode_summary
-from analysis.runs import missingness_point, over_episodes, read_runs, write_table
+from analysis.runs import over_episodes, read_runs, write_table
 from analysis.statistics import interquartile_mean, interval, probability_of_improvement, ratio
 from analysis.tables import derived_tables, point_kind, point_order
 from report import run
+from training.config import missingness_name
 from training.errors import UserError
 from training.methods import method_name, training_labels
 from training.run_folder import read_config, write_config
@@ -155,7 +156,7 @@ def test_the_probability_of_improvement_counts_pairs() -> None:
 def test_a_run_is_called_by_its_belief_unless_it_is_named(belief: str) -> None:
     config = make_config(f"belief={belief}")
     assert method_name(config) == belief
-    assert method_name(config | {"method": "mine"}) == "mine"
+    assert method_name({**config} | {"method": "mine"}) == "mine"
     assert method_name(make_config(f"belief={belief}", "algo=acktr")) == f"{belief} (acktr)"
 
 
@@ -174,7 +175,7 @@ def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it() -> None:
     ordered = sorted(shuffled, key=dict(zip(shuffled, point_order(pd.Series(shuffled)), strict=True)).get)  # fmt: skip # noqa: E501
     assert ordered == ["training", "none:0", "mcar:0.2", "mcar:0.8", "noise:3", "noise:10"]
     outages = make_config("missingness=outages", "missingness.mean_length=20")["missingness"]
-    assert missingness_point(outages).endswith(":20:sensor")
+    assert missingness_name(outages).endswith(":20:sensor")
 
 
 # Tables -----------------------------------------------------------------------------------------

@@ -9,9 +9,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
 from torch.distributions import kl_divergence
+from torchrl.objectives import LossModule
+from torchrl.objectives.value import GAE
 from training.agent import Agent
-from training.config import Settings
 from training.errors import UserError
+from training.ppo import GradientSteps
 
 from algorithms.kfac import KFAC
 
@@ -28,24 +30,39 @@ class ACKTR:
 
     Args:
         agent: whose parameters are changed; its belief module has none of its own.
+        loss: unused, as are ``steps`` and ``gae``: it has losses and steps of its own.
+        steps: unused.
+        gae: unused.
         seed: of the targets drawn for the curvature.
         desired_kl: divergence of the policy over one rollout, nats.
         policy: arguments of :class:`~algorithms.kfac.KFAC`.
         critic: the same, and ``steps`` a rollout.
 
     Raises:
+        UserError: if the belief module has parameters of its own.
         ValueError: if a number makes no sense.
     """
 
     def __init__(
         self,
         agent: Agent,
-        seed: int,
         *,
+        loss: LossModule,
+        steps: GradientSteps,
+        gae: GAE,
+        seed: int,
         desired_kl: float,
         policy: Mapping[str, Any],
         critic: Mapping[str, Any],
     ) -> None:
+        del loss, steps, gae
+        if any(True for _ in agent.belief.parameters()):
+            # A recurrent layer is used many times in a sequence: its Fisher matrix has no such
+            # factors.
+            raise UserError(
+                "`algo=acktr` must have a belief module without weights (belief=none or fill); "
+                "train another one with algo=ppo."
+            )
         self.agent, self.desired_kl = agent, desired_kl
         own = dict(critic)
         self.critic_steps = int(own.pop("steps"))
@@ -150,26 +167,3 @@ def _adapted(lr: float, kl: float, desired_kl: float) -> float:
     if kl > 2 * desired_kl:
         return max(low, lr / _STEP_FACTOR)
     return min(high, lr * _STEP_FACTOR) if kl < desired_kl / 2 else lr
-
-
-def build(settings: Settings, agent: Agent, **own: Any) -> ACKTR:
-    """Build ACKTR.
-
-    Args:
-        settings: of the run.
-        agent: whose parameters it changes.
-        own: further arguments of :class:`ACKTR`, from conf/algo.
-
-    Returns:
-        The algorithm.
-
-    Raises:
-        UserError: if the belief module has parameters of its own.
-    """
-    if any(True for _ in agent.belief.parameters()):
-        # A recurrent layer is used many times in a sequence: its Fisher matrix has no such factors.
-        raise UserError(
-            f"`algo=acktr` must have a belief module without weights (none or fill), got "
-            f"belief={settings.belief.get('name')}; train that one with algo=ppo."
-        )
-    return ACKTR(agent, settings.seed, **own)

@@ -193,7 +193,7 @@ def diagnose(
         if rows != held_rows or len(held) == chunk:
             add_held()
         held_rows, observed = rows, data.get("observed")
-        reading = zero_missing(data.get("observation"), observed).double()
+        reading = zero_missing(data.get("normalized_observation"), observed).double()
         last[rows] = torch.where(observed, reading, last[rows])
         gap = torch.bucketize(since[rows] + 1, edges, right=True) - 1
         written = {name: data.get(key, None) for name, key in _WRITTEN.items()}
@@ -203,7 +203,7 @@ def diagnose(
                 "observed": observed.clone(),
                 "class": torch.where(seen[rows], gap, len(bins)),
                 READING: reading,
-                TRUTH: data.get("complete_observation").double(),
+                TRUTH: data.get("normalized_complete_observation").double(),
                 LAST_VALUE: last[rows].clone(),
                 MEAN: torch.zeros_like(reading),
             }

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.stats import hmean
+from training.config import missingness_name
 from training.errors import UserError
 from training.methods import method_name
 from training.run_folder import read_config
@@ -156,7 +157,7 @@ def _run(
     frames = int(curve.frames.max()) if len(curve) else 0
     task, noise = config["env"]["id"], config["noise"]
     spikes = noise.get("spike_probability", 0)
-    corruption = missingness_point(config["missingness"])
+    corruption = missingness_name(config["missingness"])
     early = curve[(curve.frames <= WITHIN) & (curve.episodes >= 100)]
     path = folder / "episodes.csv"
     episodes = read_table(path, ["frames", "return"]) if path.is_file() else curve.head(0)
@@ -185,14 +186,6 @@ def _run(
     }
 
 
-def missingness_point(missingness: Mapping[str, Any]) -> str:
-    """Name what is missing as recipes/evaluate.py does: ``mcar:0.5``, ``outages:0.5:20:joint``."""
-    kind, eta = missingness["mechanism"], missingness.get("eta", 0)
-    if kind == "outages":
-        return f"outages:{eta:g}:{missingness['mean_length']:g}:{missingness['group_by']}"
-    return f"{kind}:{0 if kind == 'none' else eta:g}"
-
-
 def _evaluations(
     folder: Path, config: Mapping[str, Any], shared: pd.DataFrame | None
 ) -> pd.DataFrame:
@@ -201,7 +194,7 @@ def _evaluations(
     needed = ["frames", "kind", "mode", "episodes", "return_mean"]
     own = read_table(path, needed) if path.is_file() else pd.DataFrame(columns=needed)
     own = own.rename(columns={"kind": "source"})
-    tables = [own.assign(point=missingness_point(config["missingness"]), table=path.name)]
+    tables = [own.assign(point=missingness_name(config["missingness"]), table=path.name)]
     if shared is not None:
         tables.append(over_episodes(shared[shared.run == folder.name], "over several runs"))
     paths = [folder / name for name in EPISODE_TABLES if (folder / name).is_file()]

@@ -15,15 +15,17 @@ from beliefs import (
     FORECAST,
     FORECAST_COV,
     NOISE_VARIANCE,
+    OBSERVATION,
     Belief,
 )
 from torchrl_drbpn import (
     BeliefFilter,
     BeliefFilterModule,
-    BeliefModelLoss,
     GaussianTransition,
     LinearGaussianEmission,
 )
+
+_READ = {"observation": OBSERVATION}
 
 
 class SensorVariances(nn.Module):
@@ -64,7 +66,11 @@ def observing(module: BeliefFilterModule) -> TensorDictSequential:
     wanted = ["features", ("belief", "mean"), ("belief", "log_likelihood"), cov]
     wanted += [ESTIMATE, FORECAST, FORECAST_COV]
     filtering = BeliefFilterModule(
-        module.filter, policy_input=module.policy_input, out_keys=wanted, gate=module.gate
+        module.filter,
+        in_keys=_READ,
+        policy_input=module.policy_input,
+        out_keys=wanted,
+        gate=module.gate,
     )
     variances = TensorDictModule(
         SensorVariances(module.filter.emission),
@@ -78,7 +84,6 @@ def build(
     *,
     obs_dim: int,
     action_dim: int,
-    normalize: Literal["entry", "step"],
     state_dim: int | None,
     policy_input: Literal["mean", "mean_cov"],
     transition: Mapping[str, Any],
@@ -90,7 +95,6 @@ def build(
     Args:
         obs_dim: components of an observation.
         action_dim: components of an action.
-        normalize: what the likelihood is divided by, ``entry`` or ``step``.
         state_dim: components of the latent state; None: as many as the observation, at most 32.
         policy_input: what the heads read, ``mean`` or ``mean_cov``.
         transition: arguments of ``GaussianTransition``; ``residual`` None: where state <= obs.
@@ -113,7 +117,7 @@ def build(
         emission=LinearGaussianEmission(obs_dim, state, action_dim, **emission),
         **initial,
     )
-    module = BeliefFilterModule(belief_filter, policy_input=policy_input)
+    module = BeliefFilterModule(belief_filter, in_keys=_READ, policy_input=policy_input)
 
     def summary() -> dict[str, float]:
         with torch.no_grad():
@@ -124,7 +128,6 @@ def build(
     return Belief(
         module,
         state + covariance,
-        BeliefModelLoss(normalize=normalize),
         summary=summary,
         observing=lambda: observing(module),
     )

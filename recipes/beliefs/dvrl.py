@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
-from beliefs import ESTIMATE, Belief
-from torchrl_drbpn import BeliefModelLoss, ParticleFilter, ParticleFilterModule
+from beliefs import ESTIMATE, OBSERVATION, Belief
+from torchrl_drbpn import ParticleFilter, ParticleFilterModule
+
+_READ = {"observation": OBSERVATION}
 
 
 def build(
     *,
     obs_dim: int,
     action_dim: int,
-    normalize: Literal["entry", "step"],
     num_particles: int,
     hidden_dim: int,
     latent_dim: int,
@@ -28,7 +28,6 @@ def build(
     Args:
         obs_dim: components of an observation.
         action_dim: components of an action.
-        normalize: what the bound is divided by, ``entry`` or ``step``.
         num_particles: how many particles.
         hidden_dim: components of a particle's memory, and of the features.
         latent_dim: components of a particle's latent.
@@ -53,12 +52,11 @@ def build(
         latent_min_std=latent_min_std,
         noise_seed=noise_seed,
     )
-    module = ParticleFilterModule(particle_filter)
+    module = ParticleFilterModule(particle_filter, in_keys=_READ)
     # The particles' mean; a mixture of Gaussians has no single covariance to be held to.
     written = ["features", ("belief", "log_likelihood"), ESTIMATE]
     return Belief(
         module,
         module.feature_dim,
-        BeliefModelLoss(normalize=normalize),
-        observing=lambda: ParticleFilterModule(particle_filter, out_keys=written),
+        observing=lambda: ParticleFilterModule(particle_filter, in_keys=_READ, out_keys=written),
     )

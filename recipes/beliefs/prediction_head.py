@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from beliefs import FORECAST, FORECAST_COV
+from beliefs import FORECAST, FORECAST_COV, OBSERVATION
 from torchrl_drbpn.functional import inverse_softplus, positive_std, zero_missing
 
 
@@ -44,13 +44,13 @@ class Foresight(nn.Module):
 
         Args:
             hidden: hidden state before the step, shape ``(*, hidden)``.
-            tensordict: with ``observation``, ``observed`` and ``previous_action``.
+            tensordict: with the normalised observation, ``observed`` and ``previous_action``.
 
         Returns:
             Shape ``(*,)``, nats; 0 where nothing arrived.
         """
         observed = tensordict.get("observed")
-        seen = zero_missing(tensordict.get("observation"), observed)
+        seen = zero_missing(tensordict.get(OBSERVATION), observed)
         mean, std = self.foresee(hidden, tensordict.get("previous_action"))
         normal = torch.distributions.Normal(mean, std, validate_args=False)
         density = normal.log_prob(seen)  # type: ignore[no-untyped-call]

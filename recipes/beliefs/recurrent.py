@@ -10,9 +10,8 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.modules import GRUModule, LSTMModule
 
-from beliefs import Belief
+from beliefs import OBSERVATION, Belief
 from beliefs.prediction_head import Foresight, foreseeing
-from torchrl_drbpn import BeliefModelLoss
 
 _INPUT, _STATE, _STATE_C = "recurrent_input", "recurrent_state", "recurrent_state_c"
 
@@ -66,7 +65,7 @@ class RecurrentBelief(TensorDictModuleBase):
         self.foresight = Foresight(
             hidden_size, obs_dim, action_dim, init_std=init_std, min_std=min_std
         )
-        self.in_keys = ["observation", "observed", "previous_action", "is_init", *states]
+        self.in_keys = [OBSERVATION, "observed", "previous_action", "is_init", *states]
         self.out_keys = ["features", ("belief", "log_likelihood"), *self.memory.out_keys[1:]]
 
     @dispatch
@@ -79,7 +78,7 @@ class RecurrentBelief(TensorDictModuleBase):
         Returns:
             The same tensordict.
         """
-        observation = tensordict.get("observation")
+        observation = tensordict.get(OBSERVATION)
         observed = tensordict.get("observed")
         is_init = tensordict.get("is_init")
         parts = [observation, observed.to(observation.dtype)]
@@ -121,7 +120,6 @@ def build(
     *,
     obs_dim: int,
     action_dim: int,
-    normalize: Literal["entry", "step"],
     cell: Literal["gru", "lstm"],
     hidden_size: int,
     with_action: bool,
@@ -133,7 +131,6 @@ def build(
     Args:
         obs_dim: components of an observation.
         action_dim: components of an action.
-        normalize: what the likelihood is divided by, ``entry`` or ``step``.
         cell: ``gru`` or ``lstm``.
         hidden_size: width of the hidden state.
         with_action: whether the network reads the previous action.
@@ -155,6 +152,5 @@ def build(
     return Belief(
         module,
         hidden_size,
-        BeliefModelLoss(normalize=normalize),
         observing=lambda: foreseeing(module, module.foresight, _STATE, last_layer),
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
@@ -13,9 +11,8 @@ from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
-from beliefs import Belief
+from beliefs import OBSERVATION, Belief
 from beliefs.prediction_head import Foresight, foreseeing
-from torchrl_drbpn import BeliefModelLoss
 
 _MEMORY: NestedKey = ("recurrent", "memory")
 _LENGTH: NestedKey = ("recurrent", "length")
@@ -199,7 +196,7 @@ class TransformerBelief(TensorDictModuleBase):
         self.layers = nn.ModuleList(MemoryLayer(width, heads, window) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         self.foresight = Foresight(width, obs_dim, action_dim, init_std=init_std, min_std=min_std)
-        self.in_keys = ["observation", "observed", "previous_action", "is_init", *_STATE]
+        self.in_keys = [OBSERVATION, "observed", "previous_action", "is_init", *_STATE]
         self.out_keys = [
             "features",
             ("belief", "log_likelihood"),
@@ -227,7 +224,7 @@ class TransformerBelief(TensorDictModuleBase):
         Returns:
             The same tensordict.
         """
-        observation = tensordict.get("observation")
+        observation = tensordict.get(OBSERVATION)
         seen = tensordict.get("observed").to(observation.dtype)
         token = torch.cat([observation, seen, tensordict.get("previous_action")], -1)
         is_init = tensordict.get("is_init")
@@ -296,7 +293,6 @@ def build(
     *,
     obs_dim: int,
     action_dim: int,
-    normalize: Literal["entry", "step"],
     window: int,
     width: int,
     heads: int,
@@ -309,7 +305,6 @@ def build(
     Args:
         obs_dim: components of an observation.
         action_dim: components of an action.
-        normalize: what the likelihood is divided by, ``entry`` or ``step``.
         window: steps that a layer attends over.
         width: of tokens and features.
         heads: attention heads.
@@ -333,6 +328,5 @@ def build(
     return Belief(
         module,
         width,
-        BeliefModelLoss(normalize=normalize),
         observing=lambda: foreseeing(module, module.foresight, _HIDDEN, lambda hidden: hidden),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,19 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 from training.config import (
     GROUPINGS,
-    MissingnessSettings,
-    NoiseSettings,
-    Settings,
-    check_outages,
+    choice,
+    missingness_kind,
     missingness_name,
 )
 from training.errors import UserError
 
 from evaluation.sensor_choice import kept_sensors
 from evaluation.trained import TrainedAgent
+from torchrl_drbpn.functional import outage_rates
 
 _MECHANISMS = ("none", "mcar", "mar", "nmar")
 _SELECTIONS = ("model", "random")
@@ -43,37 +42,37 @@ class Condition:
 
     name: str
     family: str
-    missingness: MissingnessSettings
-    noise: NoiseSettings
+    missingness: DictConfig
+    noise: DictConfig
     ratio: float = 0.0
     selection: str = ""
 
     def columns(self) -> dict[str, Any]:
         """Return the columns of a table that describe it; None where one does not apply."""
         missing, noise = self.missingness, self.noise
-        outages = missing.mechanism == "outages"
+        kind, std = missingness_kind(missing), noise.get("spike_std")
         return {
             "point": self.name,
             "family": self.family,
-            "mechanism": missing.mechanism,
-            "eta": 0.0 if missing.mechanism == "none" else missing.eta,
-            "mechanism_seed": missing.mechanism_seed,
-            "mean_length": missing.mean_length if outages else None,
-            "group_by": missing.group_by if outages else None,
+            "mechanism": kind,
+            "eta": missing.get("eta"),
+            "mechanism_seed": missing.get("mechanism_seed"),
+            "mean_length": missing.get("mean_length"),
+            "group_by": missing.get("group_by"),
             "removed_ratio": self.ratio if self.selection else None,
             "removed_by": self.selection or None,
             "noise_sigma": noise.sigma,
-            "spike_probability": noise.spike_probability,
-            "spike_std": noise.spike_std if noise.spike_probability > 0 else None,
+            "spike_probability": noise.get("spike_probability", 0.0),
+            "spike_std": std if noise.get("spike_probability") else None,
         }
 
 
-def parse_condition(text: str, settings: Settings, *, spike_std: float) -> Condition:
+def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Condition:
     """Read a condition.
 
     Args:
         text: such as ``mcar:0.5``, see conf/evaluate.yaml.
-        settings: of the run: what the text does not name stays.
+        settings: configuration of the run: what the text does not name stays.
         spike_std: deviation of spikes where the text gives none, raw units.
 
     Returns:
@@ -83,29 +82,28 @@ def parse_condition(text: str, settings: Settings, *, spike_std: float) -> Condi
         UserError: if the text can't be read.
     """
     missing, noise = settings.missingness, settings.noise
-    replace = dataclasses.replace
     match text.split(":"):
         case ["trained"]:
-            return Condition(missingness_name(missing), missing.mechanism, missing, noise)
+            return Condition(missingness_name(missing), missingness_kind(missing), missing, noise)
         case ["noise", level] if (sigma := _number(level)) is not None:
-            return Condition(f"noise:{sigma:g}", "noise", missing, replace(noise, sigma=sigma))
+            return Condition(f"noise:{sigma:g}", "noise", missing, _with(noise, sigma=sigma))
         case ["spikes", share, *rest] if (p := _number(share, 1.0)) is not None and len(rest) < 2:
             std = _number(rest[0]) if rest else spike_std
             if std is not None:
-                spiked = replace(noise, spike_probability=p, spike_std=std)
+                spiked = _with(noise, spike_probability=p, spike_std=std)
                 return Condition(f"spikes:{p:g}:{std:g}", "spikes", missing, spiked)
         case ["reduction", share, by] if (r := _number(share, 1.0)) is not None:
             if by in _SELECTIONS:
-                nothing = replace(missing, mechanism="none", eta=0.0)
+                nothing = choice("missingness", "none")
                 return Condition(f"reduction:{r:g}:{by}", "reduction", nothing, noise, r, by)
         case ["outages", share, length, *rest] if len(rest) < 2:
             eta, mean, by = _number(share, 1.0), _number(length), rest[0] if rest else "sensor"
             if eta is not None and mean is not None and by in GROUPINGS:
-                out = replace(missing, mechanism="outages", eta=eta, mean_length=mean, group_by=by)
-                check_outages(out)
+                out = choice("missingness", "outages", eta=eta, mean_length=mean, group_by=by)
+                _check_outages(eta, mean)
                 return Condition(missingness_name(out), "outages", out, noise)
         case [family, share] if family in _MECHANISMS and (eta := _number(share, 1.0)) is not None:
-            changed = replace(missing, mechanism=family, eta=eta)
+            changed = _mechanism(family, eta, missing)
             return Condition(missingness_name(changed), family, changed, noise)
     raise UserError(
         "`points` must hold trained or mechanism:eta such as mcar:0.5, with one of none, mcar, "
@@ -116,13 +114,13 @@ def parse_condition(text: str, settings: Settings, *, spike_std: float) -> Condi
 
 
 def parse_conditions(
-    texts: Sequence[Any], settings: Settings, *, spike_std: float
+    texts: Sequence[Any], settings: DictConfig, *, spike_std: float
 ) -> list[Condition]:
     """Read conditions; one that comes twice, under two names perhaps, is one.
 
     Args:
         texts: see conf/evaluate.yaml.
-        settings: of the run.
+        settings: configuration of the run.
         spike_std: deviation of spikes where a text gives none, raw units.
 
     Returns:
@@ -199,6 +197,28 @@ def removed_sensors(
         order = np.random.default_rng((reduction_seed, episode)).permutation(trained.obs_dim)
         row[torch.from_numpy(order[:count])] = True
     return removed
+
+
+def _with(node: DictConfig, **values: Any) -> DictConfig:
+    """Return a node of the configuration with other or further values."""
+    return OmegaConf.create({str(key): node[key] for key in node} | values)
+
+
+def _mechanism(family: str, eta: float, trained: DictConfig) -> DictConfig:
+    """Return missingness of another family; what both have stays as in training."""
+    node = choice("missingness", family, **({} if family == "none" else {"eta": eta}))
+    for key in ("always_observed", "mechanism_seed"):
+        if key in node and key in trained:
+            node[key] = trained[key]
+    return node
+
+
+def _check_outages(eta: float, mean_length: float) -> None:
+    """Refuse a ratio and a mean length of which there is no Markov chain."""
+    try:
+        outage_rates(eta, mean_length)
+    except ValueError as error:
+        raise UserError(f"missingness=outages: {error}") from error
 
 
 def _number(text: str, most: float = math.inf) -> float | None:

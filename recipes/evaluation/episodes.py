@@ -13,15 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from beliefs import Belief
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from training.agent import Agent, add_primers
-from training.config import MissingnessSettings, NoiseSettings, Settings
-from training.envs import copy_statistics, make_environment
+from training.envs import make_env
 
 from torchrl_drbpn import SensorReduction, seed_env
 
@@ -81,23 +80,19 @@ class Episodes:
 
 
 def make_evaluation_environment(
-    settings: Settings,
-    belief: Belief,
+    config: DictConfig,
     agent: Agent,
     *,
-    statistics: TransformedEnv,
-    missingness: MissingnessSettings | None = None,
-    noise: NoiseSettings | None = None,
+    missingness: DictConfig | None = None,
+    noise: DictConfig | None = None,
     complete: bool = False,
     removed: Tensor | None = None,
 ) -> TransformedEnv:
     """Build a batch of `BLOCK` environments like the training ones.
 
     Args:
-        settings: of the run.
-        belief: whose transforms are needed.
+        config: of the run.
         agent: whose recurrent state is carried.
-        statistics: the environment whose normalisation is used, frozen.
         missingness: what does not arrive; None: as in training.
         noise: what is added; None: as in training.
         complete: whether to write ``complete_observation`` too, for measurements alone.
@@ -107,21 +102,17 @@ def make_evaluation_environment(
     Returns:
         The environment.
     """
-    env = make_environment(
-        settings.env,
-        missingness or settings.missingness,
-        noise or settings.noise,
-        settings.normalisation,
+    changed = config.copy()
+    changed.missingness = missingness or config.missingness
+    changed.noise = noise or config.noise
+    env = make_env(
+        changed,
         num_envs=BLOCK,
-        num_threads=settings.collector.num_threads,
-        gamma=settings.loss.gamma,
-        seed=settings.evaluation.seed,
+        seed=config.evaluation.seed,
         complete=complete,
-        before_normalisation=[] if removed is None else [SensorReduction(removed)],
-        after_normalisation=belief.transforms(),
+        transforms={} if removed is None else {"reduction": SensorReduction(removed)},
     )
     add_primers(env, agent)
-    copy_statistics(statistics, env)
     return env
 
 
@@ -264,7 +255,7 @@ class StoppingPolicy(TensorDictModuleBase):
 
     def __init__(self, agent: Agent) -> None:
         super().__init__()
-        self.belief, self.actor = agent.belief, agent.actor
+        self.norm, self.belief, self.actor = agent.norm, agent.belief, agent.actor
         self.in_keys = list(agent.policy.in_keys)
         self.out_keys = [*agent.policy.out_keys, "diverged"]
         self._stopped = torch.zeros(())
@@ -275,7 +266,7 @@ class StoppingPolicy(TensorDictModuleBase):
         for part in checking:  # what is not finite is written, in the place of an error
             part.validate = False
         try:
-            tensordict = self.belief(tensordict)
+            tensordict = self.belief(self.norm(tensordict))
         finally:
             for part in checking:
                 part.validate = True

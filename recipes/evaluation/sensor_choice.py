@@ -18,7 +18,7 @@ from torch import Tensor
 from training.errors import UserError
 
 from evaluation.trained import TrainedAgent
-from torchrl_drbpn import BeliefFilterModule, MaskedObservationNorm, select_sensors
+from torchrl_drbpn import BeliefFilterModule, select_sensors
 
 
 @dataclass(frozen=True)
@@ -110,16 +110,17 @@ def learned_sensors(trained: TrainedAgent) -> SensorModel:
             "(belief.transition.cov_network=true), so no one P ranks its sensors: take a run with "
             "cov_network=false."
         )
-    norm = next(t for t in trained.statistics.transform if isinstance(t, MaskedObservationNorm))
     noise = trained.settings.noise
-    variance = (noise.sigma * noise.scale) ** 2 + noise.spike_probability * noise.spike_std**2
+    variance = (noise.sigma * noise.scale) ** 2
+    if "spike_probability" in noise:
+        variance += noise.spike_probability * noise.spike_std**2
     return SensorModel(
         trained.sensors,
         trained.settings.seed,
         model.emission_matrix.double().detach(),
         model.constant_cov().double().detach(),
         model.full_emission_cov().double().detach(),
-        math.sqrt(variance) / norm.scale.double(),
+        math.sqrt(variance) / trained.agent.norm.std.double(),
     )
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import pandas as pd
 import torch
 from training.config import missingness_name
+from training.envs import env_name
 from training.errors import UserError
 from training.run_folder import write_whole
 
@@ -149,7 +150,7 @@ def identity(trained: TrainedAgent) -> dict[str, Any]:
     """
     settings = trained.settings
     return {
-        "env": settings.env.env_id,
+        "env": env_name(settings),
         "belief": settings.belief.get("name", ""),
         "method": trained.method,
         "training_seed": settings.seed,

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from beliefs import Belief
+from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from training.agent import Agent, add_primers
-from training.checkpoint import last_checkpoint, load_checkpoint
-from training.config import MissingnessSettings, NoiseSettings, Settings, read_settings
-from training.envs import make_environment
+from training.agent import Agent, load_agent
+from training.envs import make_env
 from training.errors import UserError
-from training.loop import make_agent
 from training.methods import method_name
-from training.run_folder import read_config
+from training.run_folder import load_config
 from training.sensors import sensor_names
 
 from evaluation.episodes import BLOCK, make_evaluation_environment
@@ -29,25 +27,21 @@ class TrainedAgent:
     """The last checkpoint of a run, ready to act.
 
     Attributes:
-        settings: of the run.
-        belief: its belief module and what belongs to it.
+        settings: configuration of the run.
         agent: with the trained weights.
-        statistics: an environment that holds the trained normalisation.
         frames: environment steps of the checkpoint.
         method: what it is called in tables and figures.
     """
 
-    settings: Settings
-    belief: Belief
+    settings: DictConfig
     agent: Agent
-    statistics: TransformedEnv
     frames: int
     method: str
 
     @property
     def obs_dim(self) -> int:
         """Return the number of sensors."""
-        return self.statistics.observation_spec["observation"].shape[-1]
+        return self.agent.norm.obs_dim
 
     @property
     def sensors(self) -> list[str]:
@@ -57,13 +51,13 @@ class TrainedAgent:
     @property
     def observing_policy(self) -> TensorDictSequential:
         """Return a policy that also writes what the belief knows of the sensors."""
-        make = self.belief.observing
-        return TensorDictSequential(make() if make else self.agent.belief, self.agent.actor)
+        make, agent = self.agent.observing, self.agent
+        return TensorDictSequential(agent.norm, make() if make else agent.belief, agent.actor)
 
     def environments(
         self,
-        missingness: MissingnessSettings | None = None,
-        noise: NoiseSettings | None = None,
+        missingness: DictConfig | None = None,
+        noise: DictConfig | None = None,
         removed: Tensor | None = None,
         *,
         complete: bool = False,
@@ -88,9 +82,7 @@ class TrainedAgent:
                 gone[: len(own)] = own
             return make_evaluation_environment(
                 self.settings,
-                self.belief,
                 self.agent,
-                statistics=self.statistics,
                 missingness=missingness,
                 noise=noise,
                 complete=complete,
@@ -114,32 +106,10 @@ def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
     Raises:
         UserError: if the folder or the checkpoint can't be used, or the gate is refused.
     """
-    config = read_config(folder)
-    settings = read_settings(config)
-    path = last_checkpoint(folder)
-    state = load_checkpoint(path)
-    belief, agent = make_agent(settings)
-    statistics = make_environment(
-        settings.env,
-        settings.missingness,
-        settings.noise,
-        settings.normalisation,
-        num_envs=1,
-        num_threads=1,
-        gamma=settings.loss.gamma,
-        seed=settings.seed,
-        after_normalisation=belief.transforms(),
-    )
-    add_primers(statistics, agent)
-    try:
-        agent.load_state_dict(state["agent"])
-        statistics.load_state_dict(state["transforms"])
-        frames = int(state["progress"]["frames"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise UserError(
-            f"`{path}` does not fit {folder / 'config.yaml'}: {' '.join(str(error).split())[:300]}"
-        ) from error
-    trained = TrainedAgent(settings, belief, agent, statistics, frames, method_name(config))
+    config = load_config(folder)
+    with closing(make_env(config, num_envs=1)) as env:
+        agent, frames = load_agent(folder, config, env)
+    trained = TrainedAgent(config, agent, frames, method_name(config))
     return trained if gate is None else _gated(trained, gate)
 
 
@@ -147,7 +117,7 @@ def _gated(trained: TrainedAgent, gate: float) -> TrainedAgent:
     module = trained.agent.belief
     if not isinstance(module, BeliefFilterModule):
         raise UserError(
-            f"`gate` must be null for belief={trained.settings.belief.get('name')}, got {gate!r}: "
+            f"`gate` must be null for belief={trained.settings.belief.name}, got {gate!r}: "
             "only belief=drbpn has a forecast of its readings to hold them against."
         )
     try:

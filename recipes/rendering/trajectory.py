@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from training.console import say
+from training.envs import env_name
 from training.errors import UserError
 
 from torchrl_drbpn.functional import zero_missing
@@ -153,12 +154,12 @@ def record_episode(
         UserError: if the episode is over before ``start``.
     """
     # States are read from Gymnasium's simulators, whatever the agent was trained on.
-    settings = trained.settings
-    local = replace(settings, env=replace(settings.env, backend="gymnasium"))
+    local = trained.settings.copy()
+    local.env.backend = "gymnasium"
     make = replace(trained, settings=local).environments(
         condition.missingness, condition.noise, removed, complete=True
     )
-    camera = _camera(settings.env.env_id, picture_size) if picture_size else None
+    camera = _camera(env_name(local), picture_size) if picture_size else None
     env: Any = None
     rows: list[tuple[Tensor, ...]] = []
     pictures: list[Picture] = []
@@ -198,7 +199,7 @@ def record_episode(
         torch.stack(column).numpy() for column in zip(*rows, strict=True)
     )
     return Recording(
-        settings.env.env_id,
+        env_name(local),
         trained.sensors,
         start,
         complete,
@@ -234,7 +235,7 @@ def _told(data: TensorDictBase) -> Told:
 
 def _sensors(data: TensorDictBase) -> tuple[Tensor, ...]:
     """Return complete, arrived, observed, estimate and its deviation, shape (obs,) each."""
-    complete, observed = data["complete_observation"].double(), data["observed"].clone()
+    complete, observed = data["normalized_complete_observation"].double(), data["observed"].clone()
     unknown = torch.full_like(complete, torch.nan)
     estimate, variance = data.get(ESTIMATE, None), data.get(ESTIMATE_VARIANCE, None)
     if estimate is None:
@@ -242,7 +243,7 @@ def _sensors(data: TensorDictBase) -> tuple[Tensor, ...]:
         variance = None if cov is None else cov.diagonal()
     return (
         complete,
-        zero_missing(data["observation"], observed).double(),
+        zero_missing(data["normalized_observation"], observed).double(),
         observed,
         estimate.double(),
         unknown if variance is None else variance.double().clamp_min(0).sqrt(),

@@ -1,32 +1,47 @@
-"""The agent: belief module, policy head, value head, and the loss that trains them."""
+"""The agent: normalisation, belief module, policy head and value head.
+
+Building one, and reading one back, takes three calls; a run's folder holds all they need::
+
+    config = load_config(folder)             # training.run_folder: what Hydra composed
+    env = make_env(config, num_envs=4)       # training.envs: simulators and corruption
+    agent = make_agent(config, env)          # here; add_primers(env, agent) makes env step it
+    agent, frames = load_agent(folder, config, env)   # the same with trained weights
+
+``agent.policy`` is a ``TensorDictSequential`` of ``agent.norm``, ``agent.belief`` and
+``agent.actor``; ``agent.observing()`` is a belief module that writes what it knows of the sensors.
+"""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import torch
 from beliefs import Belief
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
     TensorDictModule,
+    TensorDictModuleBase,
     TensorDictSequential,
 )
 from torch import nn
 from torchrl.envs import TransformedEnv
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.modules.utils import get_primers_from_module
-from torchrl.objectives import ClipPPOLoss, LossModule
 
-from torchrl_drbpn import DRBPNLoss
-from training.config import HeadSettings, LossSettings
+from torchrl_drbpn.modules import MaskedObservationNorm
+from training.checkpoint import fitting, last_checkpoint, load_checkpoint
+from training.config import build
+from training.envs import COMPLETE
 
-# Written by the environment on request, read by a critic on request, by a policy never.
-COMPLETE = "complete_observation"
+_SCALED_COMPLETE = f"normalized_{COMPLETE}"
 
 
 class Agent(nn.Module):
-    """Hold a belief module and the two heads that read its features.
+    """Hold what decides and what values.
 
     A critic may see more than the policy, as it is left behind after training (asymmetric
     actor-critic, [Pinto et al. 2018]). It reads the complete observation beside the features, not
@@ -34,78 +49,37 @@ class Agent(nn.Module):
     critic without it is biased [Baisero and Amato 2022].
 
     Args:
+        norm: standardises observations; learns by ``norm.update(rollout)`` alone.
         belief: the belief module and what belongs to it.
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        heads: sizes and initialisation of the heads.
+        actor: the policy head, a distribution over actions given ``features``.
+        critic: the value head, ``state_value`` given ``features`` and perhaps more.
 
     Attributes:
-        belief: the belief module.
-        actor: the policy head, a distribution over actions given ``features``.
-        critic: the value head, ``state_value`` given ``features`` and, with
-            ``heads.critic_input=complete``, the complete observation.
-        policy: belief module, then policy head.
-        model_loss: the loss of the belief's own model, or None.
+        policy: normalisation, belief module, policy head.
+        summary: numbers of the belief worth a column of metrics.csv.
+        observing: makes the belief module that also writes what it knows of the sensors; None.
     """
 
-    def __init__(self, belief: Belief, obs_dim: int, action_dim: int, heads: HeadSettings) -> None:
+    def __init__(
+        self,
+        norm: MaskedObservationNorm,
+        belief: Belief,
+        actor: ProbabilisticActor,
+        critic: ValueOperator,
+    ) -> None:
         super().__init__()
-        self.belief = belief.module
-        self.model_loss = belief.model_loss
-        sizes = [belief.feature_dim, *heads.hidden]
-        location = _mlp([*sizes, action_dim], heads.hidden_gain, heads.policy_gain)
-        scale = AddStateIndependentNormalScale(action_dim)
-        nn.init.constant_(scale.state_independent_scale, heads.log_std)
-        self.actor = ProbabilisticActor(
-            TensorDictModule(
-                nn.Sequential(location, scale), in_keys=["features"], out_keys=["loc", "scale"]
-            ),
-            in_keys=["loc", "scale"],
-            distribution_class=IndependentNormal,
-            return_log_prob=True,
-        )
-        complete = heads.critic_input == "complete"
-        width = belief.feature_dim + (obs_dim if complete else 0)
-        value = _mlp([width, *heads.hidden, 1], heads.hidden_gain, heads.value_gain)
-        self.critic = ValueOperator(
-            _SideBySide(*value) if complete else value,
-            in_keys=["features", COMPLETE] if complete else ["features"],
-        )
+        self.norm, self.belief, self.actor, self.critic = norm, belief.module, actor, critic
+        self.summary: Callable[[], Mapping[str, float]] = belief.summary
+        self.observing: Callable[[], TensorDictModuleBase] | None = belief.observing
         # Not registered a second time: its parts are above.
-        self.__dict__["policy"] = TensorDictSequential(self.belief, self.actor)
+        self.__dict__["policy"] = TensorDictSequential(norm, belief.module, actor)
 
     policy: TensorDictSequential
 
-    def make_loss(self, settings: LossSettings) -> LossModule:
-        """Build the loss: PPO and, where the belief has a model, its likelihood.
-
-        Args:
-            settings: its coefficients.
-
-        Returns:
-            A loss whose outputs named ``loss*`` are to be summed.
-        """
-        ppo = ClipPPOLoss(
-            self.actor,
-            self.critic,
-            clip_epsilon=settings.clip_epsilon,
-            entropy_bonus=settings.entropy_coeff > 0,
-            entropy_coeff=settings.entropy_coeff,
-            critic_coeff=settings.critic_coeff,
-            loss_critic_type=settings.loss_critic_type,
-            normalize_advantage=settings.normalize_advantage,
-            # The recipe reports it once a rollout; here it is a fifth of the PPO loss.
-            log_explained_variance=False,
-            # The parameters are those of the modules: swapping them in costs a tenth of an update.
-            functional=False,
-        )
-        return DRBPNLoss(
-            self.belief,
-            ppo,
-            self.model_loss,
-            model_coeff=settings.model_coeff,
-            detach_belief=settings.detach_belief,
-        )
+    @property
+    def recurrent(self) -> bool:
+        """Return whether the belief module carries a state from step to step."""
+        return get_primers_from_module(self.belief, warn=False) is not None
 
     def value(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Return V of the beliefs that are stored in a rollout.
@@ -129,7 +103,7 @@ class Agent(nn.Module):
         gives the beliefs that follow, truncated and terminal steps included.
 
         Args:
-            tensordict: a rollout or its ``"next"``, any shape.
+            tensordict: a rollout or its ``"next"``, normalised, any shape.
             where: bool of that shape; the steps to value. None: all.
 
         Returns:
@@ -140,6 +114,127 @@ class Agent(nn.Module):
         single = read.reshape(-1) if where is None else read[where]
         value = self.value(self.belief(single))
         return value if where is not None else value.reshape(*tensordict.shape, 1)
+
+
+def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
+    """Build an agent, with weights from torch's global generator.
+
+    Args:
+        config: of the run.
+        env: whose observations and actions it has.
+
+    Returns:
+        The agent.
+
+    Raises:
+        UserError: if a part refuses its settings.
+    """
+    obs_dim = env.observation_spec["observation"].shape[-1]
+    action_dim = env.action_spec.shape[-1]
+    norm = build(
+        "normalisation.observation",
+        config.normalisation.observation,
+        obs_dim=obs_dim,
+        complete_keys=(COMPLETE, _SCALED_COMPLETE),
+    )
+    belief: Belief = build("belief", config.belief, obs_dim=obs_dim, action_dim=action_dim)
+    actor, critic = build(
+        "heads",
+        config.heads,
+        feature_dim=belief.feature_dim,
+        obs_dim=obs_dim,
+        action_dim=action_dim,
+    )
+    return Agent(norm, belief, actor, critic)
+
+
+def load_agent(folder: Path, config: DictConfig, env: TransformedEnv) -> tuple[Agent, int]:
+    """Build the agent of a run with the weights of its last checkpoint.
+
+    Args:
+        folder: the run folder.
+        config: of the run.
+        env: whose observations and actions it has.
+
+    Returns:
+        The agent, and the environment steps it was trained for.
+
+    Raises:
+        UserError: if the checkpoint can't be used.
+    """
+    path = last_checkpoint(folder)
+    state = load_checkpoint(path)
+    agent = make_agent(config, env)
+    with fitting(str(path)):
+        agent.load_state_dict(state["agent"])
+        frames = int(state["progress"]["frames"])
+    return agent, frames
+
+
+def add_primers(env: TransformedEnv, agent: Agent) -> None:
+    """Append the entries of the belief module's recurrent state to an environment.
+
+    Args:
+        env: the environment; changed in place.
+        agent: whose belief module may be recurrent.
+    """
+    primers = get_primers_from_module(agent.belief, warn=False)
+    if primers is not None:
+        env.append_transform(primers)
+
+
+def make_heads(
+    *,
+    feature_dim: int,
+    obs_dim: int,
+    action_dim: int,
+    critic_input: str,
+    hidden: Sequence[int],
+    hidden_gain: float,
+    policy_gain: float,
+    value_gain: float,
+    log_std: float,
+) -> tuple[ProbabilisticActor, ValueOperator]:
+    """Build policy and value networks side by side.
+
+    Args:
+        feature_dim: components of ``features``.
+        obs_dim: components of an observation.
+        action_dim: components of an action.
+        critic_input: ``features``, or ``complete`` for the complete observation beside them.
+        hidden: units of the tanh layers.
+        hidden_gain: of their orthogonal weights.
+        policy_gain: of the policy's last layer.
+        value_gain: of the value's last layer.
+        log_std: log of the action's standard deviation at the start.
+
+    Returns:
+        Actor and critic.
+
+    Raises:
+        ValueError: for another ``critic_input``.
+    """
+    if critic_input not in ("features", "complete"):
+        raise ValueError(f"`critic_input` must be features or complete, got {critic_input!r}.")
+    scale = AddStateIndependentNormalScale(action_dim)
+    nn.init.constant_(scale.state_independent_scale, log_std)
+    location = _mlp([feature_dim, *hidden, action_dim], hidden_gain, policy_gain)
+    actor = ProbabilisticActor(
+        TensorDictModule(
+            nn.Sequential(location, scale), in_keys=["features"], out_keys=["loc", "scale"]
+        ),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    complete = critic_input == "complete"
+    width = feature_dim + (obs_dim if complete else 0)
+    value = _mlp([width, *hidden, 1], hidden_gain, value_gain)
+    critic = ValueOperator(
+        _SideBySide(*value) if complete else value,
+        in_keys=["features", _SCALED_COMPLETE] if complete else ["features"],
+    )
+    return actor, critic
 
 
 class _SideBySide(nn.Sequential):
@@ -160,15 +255,3 @@ def _mlp(sizes: list[int], hidden_gain: float, last_gain: float) -> nn.Sequentia
         nn.init.zeros_(linear.bias)
         layers += [linear] if last else [linear, nn.Tanh()]
     return nn.Sequential(*layers)
-
-
-def add_primers(env: TransformedEnv, agent: Agent) -> None:
-    """Append the entries of the belief module's recurrent state to an environment.
-
-    Args:
-        env: the environment; changed in place.
-        agent: whose belief module may be recurrent.
-    """
-    primers = get_primers_from_module(agent.belief, warn=False)
-    if primers is not None:
-        env.append_transform(primers)

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
 
 from training.errors import UserError
 
-_FORMAT = "torchrl_drbpn recipe checkpoint 1"
-_PATTERN = "frames_*.pt"
+_FORMAT = "torchrl_drbpn recipe checkpoint 2"
+_OLD = "torchrl_drbpn recipe checkpoint 1"
+_NAME = re.compile(r"frames_\d{12}\.pt")
 
 
 def save_checkpoint(folder: Path, frames: int, state: dict[str, Any], *, keep: int) -> Path:
-    """Write a checkpoint whole or not at all, and drop the oldest ones.
+    """Write a checkpoint whole or not at all, with its SHA-256 beside it; drop the oldest ones.
 
     Args:
         folder: the run folder.
@@ -25,19 +33,49 @@ def save_checkpoint(folder: Path, frames: int, state: dict[str, Any], *, keep: i
 
     Returns:
         The file.
+
+    Raises:
+        UserError: if it can't be written; those before it are left alone.
     """
     directory = folder / "checkpoints"
-    directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"frames_{frames:012d}.pt"
-    temporary = directory / f".{path.name}.{os.getpid()}.tmp"
-    with temporary.open("wb") as file:
-        torch.save({"format": _FORMAT, **state}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-    for old in sorted(directory.glob(_PATTERN))[:-keep]:
-        old.unlink()
+    temporary = directory / f".{path.name}.tmp"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for stale in directory.glob(".*.tmp"):  # of a writer that was killed: a run is locked
+            stale.unlink()
+        with temporary.open("wb") as file:
+            torch.save({"format": _FORMAT, **state}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        _sum_file(path).write_text(f"{_digest(temporary)}  {path.name}\n", encoding="utf-8")
+        os.replace(temporary, path)
+        for old in _checkpoints(folder)[:-keep]:
+            old.unlink()
+            _sum_file(old).unlink(missing_ok=True)
+    # torch.save answers a full disk with a RuntimeError of its archive writer.
+    except (OSError, RuntimeError) as error:
+        temporary.unlink(missing_ok=True)
+        reason = error.strerror if isinstance(error, OSError) else "is the disk full?"
+        raise UserError(
+            f"`{path}` can't be written: {reason or error}. Checkpoints before it are kept."
+        ) from error
     return path
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints of a run, oldest first; other files are nobody's business."""
+    found = (folder / "checkpoints").glob("*.pt") if (folder / "checkpoints").is_dir() else ()
+    return sorted(path for path in found if _NAME.fullmatch(path.name))
+
+
+def _sum_file(path: Path) -> Path:
+    return path.with_name(path.name + ".sha256")
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def last_checkpoint(folder: Path) -> Path:
@@ -54,7 +92,7 @@ def last_checkpoint(folder: Path) -> Path:
     """
     if not folder.is_dir():
         raise UserError(f"`{folder}` must be a run folder; there is no such folder.")
-    found = sorted((folder / "checkpoints").glob(_PATTERN))
+    found = _checkpoints(folder)
     if not found:
         raise UserError(
             f"`{folder}` holds no checkpoint: it is not a run folder, or the run ended before "
@@ -72,12 +110,12 @@ def checkpoint_frames(folder: Path) -> int | None:
     Returns:
         Steps, or None where there is no checkpoint.
     """
-    found = sorted((folder / "checkpoints").glob(_PATTERN))
+    found = _checkpoints(folder)
     return int(found[-1].stem.removeprefix("frames_")) if found else None
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint.
+    """Read a checkpoint, after its sums have been checked.
 
     Args:
         path: the file.
@@ -86,18 +124,88 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         What was given to :func:`save_checkpoint`.
 
     Raises:
-        UserError: if the file is damaged, or of another kind.
+        UserError: if the file is damaged, or of another kind; it names the one before it.
     """
-    try:
-        state = torch.load(path, weights_only=True, map_location="cpu")
-    except FileNotFoundError as error:
-        raise UserError(f"`{path}` must be a checkpoint; there is no such file.") from error
-    # torch raises what the damaged byte happens to hit: any exception here means the same.
-    except Exception as error:
+    if not path.is_file():
+        raise UserError(f"`{path}` must be a checkpoint; there is no such file.")
+    reason = _damage(path)
+    state: Any = None
+    if reason is None:
+        try:
+            state = torch.load(path, weights_only=True, map_location="cpu")
+        # torch raises what the damaged byte happens to hit: any exception here means the same.
+        except Exception as error:
+            reason = type(error).__name__
+    if reason is not None:
+        earlier = [other for other in _checkpoints(path.parents[1]) if other.name < path.name]
+        before = f" Remove it to go on from `{earlier[-1].name}`." if earlier else ""
         raise UserError(
-            f"`{path}` can't be read: it is truncated or no checkpoint "
-            f"({type(error).__name__}). Remove it to go on from the one before."
-        ) from error
+            f"`{path}` can't be read: it is damaged, truncated or no checkpoint ({reason}).{before}"
+        )
+    if isinstance(state, dict) and state.get("format") == _OLD:
+        raise UserError(
+            f"`{path}` can't be read: it is of version 0.1.0, which the code of commit 2ebd861 "
+            "reads."
+        )
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise UserError(f"`{path}` is not a checkpoint of this recipe.")
     return state
+
+
+def _damage(path: Path) -> str | None:
+    """Return what is wrong with a file: its own sums first, then the sum of the whole."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entry = archive.testzip()
+        if entry is not None:
+            return f"wrong CRC of {entry}"
+        sums = _sum_file(path)
+        if sums.is_file() and sums.read_text(encoding="utf-8").split()[:1] != [_digest(path)]:
+            return f"not as {sums.name} says"
+    # zipfile has no one error for what is no archive.
+    except Exception as error:
+        return type(error).__name__
+    return None
+
+
+@contextmanager
+def fitting(source: str) -> Iterator[None]:
+    """Turn what a state of another task, belief or size raises into one line.
+
+    Args:
+        source: where the state came from.
+
+    Raises:
+        UserError: in the place of what was raised.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        raise UserError(
+            f"`{source}` does not fit the settings of this run (another task, belief or size?): "
+            f"{' '.join(str(error).split())[:300]}"
+        ) from error
+
+
+# Collector has no public way to its carry-over, the root step from which the next rollout goes on:
+# its own state_dict leaves it out and starts new episodes. These two are the only place that knows.
+
+
+def carry_over(collector: Collector) -> dict[str, Any]:
+    """Return the step from which the next rollout goes on.
+
+    Args:
+        collector: between two rollouts.
+    """
+    return collector._carrier.to_dict()
+
+
+def set_carry_over(collector: Collector, state: dict[str, Any]) -> None:
+    """Let the next rollout go on from a saved step.
+
+    Args:
+        collector: of an environment whose simulators are in the same state.
+        state: from :func:`carry_over`.
+    """
+    batch_size = collector._carrier.batch_size
+    collector._carrier = TensorDict.from_dict(state, batch_size=batch_size)

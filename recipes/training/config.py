@@ -1,358 +1,208 @@
-"""Settings of a run as plain dataclasses; every value comes from conf/, none from here."""
+"""The configuration of a run: composed by Hydra, checked once, built part by part.
+
+What a constructor refuses by itself is not checked here a second time: see :func:`build`.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import typing
-from collections.abc import Mapping
-from dataclasses import dataclass
+import datetime
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import inf
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any
 
-from torchrl_drbpn.functional import outage_rates
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, InstantiationException
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_drbpn import BeliefDivergedError
 from training.errors import UserError
 
-T = TypeVar("T")
-
-_SEED_LIMIT = 2**63  # of torch's generators
-MECHANISMS = ("none", "mcar", "mar", "nmar", "outages")
+CONF = Path(__file__).parents[2] / "conf"
 GROUPINGS = ("sensor", "joint", "kind")
+_USER_ERROR = 2
+
+# Least and greatest value of what no constructor checks.
+_LIMITS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("seed", "evaluation.seed"), (0, 2**63 - 1)),
+    **dict.fromkeys(("threads", "env.num_threads"), (1, 256)),
+    **dict.fromkeys(("total_frames", "collector.num_envs", "collector.steps_per_env"), (1, inf)),
+    **dict.fromkeys(("optim.epochs", "optim.minibatches", "optim.sequence_length"), (1, inf)),
+    **dict.fromkeys(("checkpoint.every_frames", "checkpoint.keep"), (1, inf)),
+    **dict.fromkeys(("evaluation.every_frames", "evaluation.episodes"), (0, inf)),
+    **dict.fromkeys(("evaluation.final_episodes", "noise.sigma", "noise.scale"), (0, inf)),
+    **dict.fromkeys(("advantage.gamma", "advantage.lmbda"), (0, 1)),
+    **dict.fromkeys(("loss.critic_coeff", "loss.entropy_coeff", "loss.model_coeff"), (0, inf)),
+    **dict.fromkeys(("optim.max_grad_norm", "loss.clip_epsilon"), (1e-12, inf)),
+}
 
 
-@dataclass(frozen=True)
-class EnvSettings:
-    """Which simulated robot; see conf/env."""
-
-    name: str
-    id: str
-    version: str
-    backend: str
-
-    @property
-    def env_id(self) -> str:
-        """Return the full Gymnasium id, such as ``Walker2d-v5``."""
-        return f"{self.id}-{self.version}"
+# Composing ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class MissingnessSettings:
-    """Which entries do not arrive; see conf/missingness."""
-
-    mechanism: str
-    eta: float
-    always_observed: float
-    mechanism_seed: int
-    mean_length: float
-    group_by: str
-
-
-@dataclass(frozen=True)
-class NoiseSettings:
-    """What is added to the entries that arrive; see conf/noise."""
-
-    sigma: float
-    scale: float
-    spike_probability: float
-    spike_std: float
-
-
-@dataclass(frozen=True)
-class NormalisationSettings:
-    """Running statistics of observations and rewards; see conf/normalisation."""
-
-    observation_clip: float
-    reward_clip: float
-
-
-@dataclass(frozen=True)
-class HeadSettings:
-    """Policy and value networks; see conf/heads."""
-
-    hidden: list[int]
-    hidden_gain: float
-    policy_gain: float
-    value_gain: float
-    log_std: float
-    critic_input: str
-
-
-@dataclass(frozen=True)
-class CollectorSettings:
-    """Size of a rollout; see conf/collector."""
-
-    num_envs: int
-    steps_per_env: int
-    num_threads: int
-
-    @property
-    def frames(self) -> int:
-        """Return the environment steps of one rollout."""
-        return self.num_envs * self.steps_per_env
-
-
-@dataclass(frozen=True)
-class LossSettings:
-    """PPO and model likelihood; see conf/loss."""
-
-    gamma: float
-    lmbda: float
-    clip_epsilon: float
-    critic_coeff: float
-    loss_critic_type: str
-    entropy_coeff: float
-    normalize_advantage: bool
-    model_coeff: float
-    normalize: str
-    detach_belief: bool
-
-
-@dataclass(frozen=True)
-class OptimSettings:
-    """Optimiser, epochs, minibatches; see conf/optim."""
-
-    lr: float
-    eps: float
-    max_grad_norm: float
-    epochs: int
-    minibatches: int
-    sequence_length: int
-    recompute_advantages: bool
-
-
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """Episodes apart from the training ones; see conf/evaluation."""
-
-    every_frames: int
-    episodes: int
-    final_episodes: int
-    seed: int
-    modes: list[str]
-
-
-@dataclass(frozen=True)
-class CheckpointSettings:
-    """How often a run is saved; see conf/checkpoint."""
-
-    every_frames: int
-    keep: int
-
-
-@dataclass(frozen=True)
-class LoggerSettings:
-    """Which of TorchRL's loggers; see conf/logger."""
-
-    backend: str
-
-
-@dataclass(frozen=True)
-class Settings:
-    """All settings of a run; see conf/config.yaml."""
-
-    env: EnvSettings
-    belief: dict[str, Any]
-    missingness: MissingnessSettings
-    noise: NoiseSettings
-    normalisation: NormalisationSettings
-    heads: HeadSettings
-    collector: CollectorSettings
-    algo: dict[str, Any]
-    loss: LossSettings
-    optim: OptimSettings
-    evaluation: EvaluationSettings
-    checkpoint: CheckpointSettings
-    logger: LoggerSettings
-    method: str | None
-    seed: int
-    total_frames: int
-    threads: int
-    resume: str | None
-
-
-def read_settings(config: Mapping[str, Any]) -> Settings:
-    """Turn a resolved configuration into checked settings.
+def composed_config(overrides: Sequence[str] = (), name: str = "config") -> DictConfig:
+    """Compose and check the configuration that a command line gives, outside a Hydra job.
 
     Args:
-        config: the configuration as plain containers.
+        overrides: words of the command line.
+        name: of the file in conf/.
 
     Returns:
-        The settings.
+        The configuration.
 
     Raises:
-        UserError: if a key is missing or unknown, or a value makes no sense.
+        UserError: if conf/ has no such group or key, or a value makes no sense.
     """
-    settings = _fill(Settings, config, "")
-    _check(settings)
-    return settings
+    try:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            config = hydra.compose(name, list(overrides))
+            return checked(config, overrides) if name == "config" else config
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error)) from error
 
 
-def _fill(kind: type[T], values: Any, path: str) -> T:
-    """Build a dataclass from a mapping, one nested dataclass at a time."""
-    if not isinstance(values, Mapping):
-        raise UserError(f"`{path}` must be a group of settings, got {values!r}.")
-    hints = typing.get_type_hints(kind)
-    names = [field.name for field in dataclasses.fields(typing.cast(Any, kind))]
-    absent, unknown = [n for n in names if n not in values], [k for k in values if k not in names]
-    if absent or unknown:
-        where = f"`{path}`" if path else "the configuration"
+def choice(group: str, name: str, **values: Any) -> DictConfig:
+    """Return an entry of a config group, such as ``choice("missingness", "mcar", eta=0.5)``.
+
+    Args:
+        group: a folder of conf/.
+        name: a file in it.
+        values: keys of the entry that take another value.
+
+    Returns:
+        The entry, to be put into the configuration of a run: it may refer to other groups.
+    """
+    node = OmegaConf.load(CONF / group / f"{name}.yaml")
+    assert isinstance(node, DictConfig)
+    for key, value in values.items():
+        if key not in node:
+            raise UserError(f"`{group}={name}` has no `{key}`.")
+        node[key] = value
+    return node
+
+
+def build(name: str, node: Any, *args: Any, **kwargs: Any) -> Any:
+    """Build what a node of the configuration names; what it refuses is one line for the user.
+
+    Args:
+        name: of the node, for the error.
+        node: with a ``_target_``; ``name`` in it is a label and not handed on.
+        args: of the target.
+        kwargs: of the target, beside those of the node.
+
+    Returns:
+        What the target returns.
+
+    Raises:
+        UserError: if there is no such target, or it refuses its arguments.
+    """
+    plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+    if isinstance(plain, dict):
+        plain.pop("name", None)
+        if "_target_" not in plain:
+            raise UserError(f"`{name}` must name what is built by `_target_`.")
+    try:
+        return hydra.utils.instantiate(plain, *args, _convert_="all", **kwargs)
+    except InstantiationException as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, UserError):
+            raise cause from error
+        raise UserError(f"`{name}`: {one_line(cause)}") from error
+
+
+# Checking -------------------------------------------------------------------------------------
+
+
+def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
+    """Check types against those of the defaults, limits, and what must go together.
+
+    Args:
+        config: composed; whole floats in the place of integers are made integers.
+        overrides: the words it was composed from; Hydra must be initialised.
+
+    Returns:
+        The same configuration.
+
+    Raises:
+        UserError: if a value makes no sense.
+    """
+    groups = [word for word in overrides if (CONF / word.split("=")[0].lstrip("+~")).is_dir()]
+    defaults = hydra.compose("config", groups)
+    for key, value in _leaves(config):
+        _check_type(config, key, value, OmegaConf.select(defaults, key, default=value))
+    for key, (least, most) in _LIMITS.items():
+        value = OmegaConf.select(config, key)
+        if value is not None and not least <= value <= most:
+            wanted = f"at least {least:g}" if most == inf else f"in [{least:g}, {most:g}]"
+            raise UserError(f"`{key}` must be {wanted}, got {value}.")
+    _check_sizes(config)
+    if OmegaConf.select(config, "missingness.always_observed") == 1 and config.missingness.eta > 0:
         raise UserError(
-            f"{where} must have the keys {', '.join(names)}; "
-            f"missing: {absent or 'none'}, unknown: {unknown or 'none'}."
+            "`missingness.always_observed` must be under 1, got 1.0: nothing could go missing. "
+            "Take missingness=none."
         )
-    read = {
-        name: _value(hints[name], values[name], f"{path}.{name}" if path else name)
-        for name in names
-    }
-    return kind(**read)
-
-
-def _value(hint: Any, value: Any, path: str) -> Any:
-    """Check one value against its annotation; whole floats pass as integers and back."""
-    if dataclasses.is_dataclass(hint):
-        return _fill(typing.cast(type, hint), value, path)
-    wrong = UserError(f"`{path}` must be {_describe(hint)}, got {value!r}.")
-    if hint is float:
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) != inf:
-            return float(value)
-    elif hint is int:
-        if isinstance(value, int) and not isinstance(value, bool):
-            return value
-        if isinstance(value, float) and value.is_integer():
-            return int(value)
-    elif hint in (str, bool):
-        if isinstance(value, hint):
-            return value
-    elif typing.get_origin(hint) is list:
-        if isinstance(value, list):
-            (item,) = typing.get_args(hint)
-            return [_value(item, v, f"{path}[{i}]") for i, v in enumerate(value)]
-    elif typing.get_origin(hint) is dict:
-        if isinstance(value, Mapping):
-            return dict(value)
-    elif value is None or isinstance(value, str):
-        return value
-    raise wrong
-
-
-def _describe(hint: Any) -> str:
-    if typing.get_origin(hint) is list:
-        return "a list"
-    names = {float: "a finite number", int: "a whole number", str: "text", bool: "true or false"}
-    return names.get(hint, "text or null")
-
-
-def _check(s: Settings) -> None:
-    """Reject values that make no sense, one line each."""
-    choices = {
-        "env.backend": (s.env.backend, ("gymnasium", "envpool")),
-        "env.version": (s.env.version, ("v4", "v5")),
-        "missingness.mechanism": (s.missingness.mechanism, MECHANISMS),
-        "missingness.group_by": (s.missingness.group_by, GROUPINGS),
-        "heads.critic_input": (s.heads.critic_input, ("features", "complete")),
-        "loss.loss_critic_type": (s.loss.loss_critic_type, ("l1", "l2", "smooth_l1")),
-        "loss.normalize": (s.loss.normalize, ("entry", "step")),
-        "logger.backend": (s.logger.backend, ("csv", "tensorboard")),
-    }
-    for name, (given, valid) in choices.items():
-        if given not in valid:
-            raise UserError(f"`{name}` must be one of {', '.join(valid)}, got {given!r}.")
-    for mode in s.evaluation.modes:
+    for mode in config.evaluation.modes:
         check_mode(mode)
-    check_outages(s.missingness)
-    unit_interval = {
-        "missingness.eta": s.missingness.eta,
-        "missingness.always_observed": s.missingness.always_observed,
-        "noise.spike_probability": s.noise.spike_probability,
-        "loss.gamma": s.loss.gamma,
-        "loss.lmbda": s.loss.lmbda,
-    }
-    for name, value in unit_interval.items():
-        if not 0 <= value <= 1:
-            raise UserError(f"`{name}` must lie in [0, 1], got {value}.")
-    positive = {
-        "total_frames": s.total_frames,
-        "threads": s.threads,
-        "collector.num_envs": s.collector.num_envs,
-        "collector.steps_per_env": s.collector.steps_per_env,
-        "collector.num_threads": s.collector.num_threads,
-        "optim.epochs": s.optim.epochs,
-        "optim.minibatches": s.optim.minibatches,
-        "optim.sequence_length": s.optim.sequence_length,
-        "optim.max_grad_norm": s.optim.max_grad_norm,
-        "optim.eps": s.optim.eps,
-        "checkpoint.every_frames": s.checkpoint.every_frames,
-        "checkpoint.keep": s.checkpoint.keep,
-        "normalisation.observation_clip": s.normalisation.observation_clip,
-        "normalisation.reward_clip": s.normalisation.reward_clip,
-        "loss.clip_epsilon": s.loss.clip_epsilon,
-    }
-    for name, value in positive.items():
-        if not value > 0:
-            raise UserError(f"`{name}` must be positive, got {value}.")
-    not_negative = {
-        "seed": s.seed,
-        "noise.sigma": s.noise.sigma,
-        "noise.scale": s.noise.scale,
-        "noise.spike_std": s.noise.spike_std,
-        "optim.lr": s.optim.lr,
-        "loss.critic_coeff": s.loss.critic_coeff,
-        "loss.entropy_coeff": s.loss.entropy_coeff,
-        "loss.model_coeff": s.loss.model_coeff,
-        "missingness.mechanism_seed": s.missingness.mechanism_seed,
-        "evaluation.seed": s.evaluation.seed,
-        "evaluation.every_frames": s.evaluation.every_frames,
-        "evaluation.episodes": s.evaluation.episodes,
-        "evaluation.final_episodes": s.evaluation.final_episodes,
-    }
-    for name, value in not_negative.items():
-        if not value >= 0:
-            raise UserError(f"`{name}` must be 0 or more, got {value}.")
-    for name in ("seed", "missingness.mechanism_seed", "evaluation.seed"):
-        if not_negative[name] >= _SEED_LIMIT:
-            raise UserError(f"`{name}` must be under 2**63, got {not_negative[name]}.")
-    if s.collector.steps_per_env % s.optim.sequence_length:
+    return config
+
+
+def _check_sizes(config: DictConfig) -> None:
+    """Check that a rollout can be cut into sequences and minibatches."""
+    optim, collector = config.optim, config.collector
+    if "minibatches" not in optim or "steps_per_env" not in collector:
+        return  # somebody's own
+    if collector.steps_per_env % optim.sequence_length:
         raise UserError(
             f"`optim.sequence_length` must divide `collector.steps_per_env`, "
-            f"got {s.optim.sequence_length} and {s.collector.steps_per_env}."
+            f"got {optim.sequence_length} and {collector.steps_per_env}."
         )
-    sequences = s.collector.frames // s.optim.sequence_length
-    if sequences % s.optim.minibatches:
+    sequences = collector.num_envs * collector.steps_per_env // optim.sequence_length
+    if sequences % optim.minibatches:
         raise UserError(
             f"`optim.minibatches` must divide the {sequences} sequences of a rollout, "
-            f"got {s.optim.minibatches}."
+            f"got {optim.minibatches}."
         )
 
 
-def check_outages(missingness: MissingnessSettings) -> None:
-    """Check that there is a Markov chain with the ratio and the mean length of an outage.
-
-    Args:
-        missingness: any; only outages are looked at.
-
-    Raises:
-        UserError: if there is none.
-    """
-    if missingness.mechanism != "outages":
+def _check_type(config: DictConfig, key: str, value: Any, default: Any) -> None:
+    """Hold a value to the type of its default; null stands for any."""
+    if default is None or isinstance(default, (DictConfig, ListConfig)) or value is default:
         return
-    try:
-        outage_rates(missingness.eta, missingness.mean_length)
-    except ValueError as error:
-        raise UserError(f"missingness=outages: {error}") from error
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if isinstance(default, bool):
+        right, wanted = isinstance(value, bool), "true or false"
+    elif isinstance(default, int):
+        right, wanted = number and float(value).is_integer(), "a whole number"
+        if right:
+            OmegaConf.update(config, key, int(value))
+    elif isinstance(default, float):
+        right, wanted = (number and abs(value) < inf) or default != default, "a finite number"
+    else:
+        right, wanted = isinstance(value, str), "text"
+    if not right:
+        raise UserError(f"`{key}` must be {wanted}, got {value!r}.")
 
 
-def missingness_name(missingness: MissingnessSettings) -> str:
-    """Return missingness as a point, such as ``mcar:0.5`` or ``outages:0.5:20:sensor``.
-
-    Args:
-        missingness: mechanism, eta and, of outages, their length and groups.
-
-    Returns:
-        Text that :func:`evaluation.conditions.parse_condition` reads back.
-    """
-    m = missingness
-    if m.mechanism == "outages":
-        return f"outages:{m.eta:g}:{m.mean_length:g}:{m.group_by}"
-    return f"{m.mechanism}:{0.0 if m.mechanism == 'none' else m.eta:g}"
+def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of every entry that holds no others."""
+    if isinstance(node, DictConfig):
+        for key in node:
+            if OmegaConf.is_interpolation(node, str(key)):
+                continue  # checked where it comes from
+            missing = OmegaConf.is_missing(node, key)
+            name = f"{path}.{key!s}" if path else str(key)
+            if missing:
+                raise UserError(f"`{name}` must be given.")
+            yield from _leaves(node[key], name)
+    else:
+        yield path, node
 
 
 def check_mode(mode: str) -> None:
@@ -366,3 +216,156 @@ def check_mode(mode: str) -> None:
     """
     if mode not in ("sampled", "mean"):
         raise UserError(f"`modes` must hold sampled and mean, got {mode!r}.")
+
+
+def missingness_kind(node: Mapping[str, Any]) -> str:
+    """Return what makes entries go missing, by a node of conf/missingness.
+
+    Args:
+        node: ``missingness`` of a run.
+
+    Returns:
+        ``none``, ``mcar``, ``mar``, ``nmar``, ``outages``, or the name of somebody's own target.
+    """
+    if "mean_length" in node:
+        return "outages"
+    if node.get("eta") == 0:
+        return "none"
+    return str(node.get("mechanism") or node["_target_"].rpartition(".")[2])
+
+
+def missingness_name(node: Mapping[str, Any]) -> str:
+    """Return missingness as a condition, such as ``mcar:0.5`` or ``outages:0.5:20:sensor``.
+
+    Args:
+        node: ``missingness`` of a run.
+
+    Returns:
+        Text that recipes/evaluate.py reads back.
+    """
+    kind = missingness_kind(node)
+    if kind == "outages":
+        return f"outages:{node['eta']:g}:{node['mean_length']:g}:{node['group_by']}"
+    return f"{kind}:{node['eta']:g}" if "eta" in node else kind
+
+
+# Names of folders -----------------------------------------------------------------------------
+
+
+def _run_folder(resume: str | None, env: str, version: str | None, belief: str, seed: int) -> str:
+    """Return the folder that ``resume`` names, or make one that nobody has."""
+    return resume or new_folder(f"{env}{f'-{version}' if version else ''}-{belief}-seed{seed}")
+
+
+def new_folder(name: str) -> str:
+    """Make a folder in runs/ that nobody has.
+
+    Args:
+        name: what its name begins with; the time follows.
+
+    Returns:
+        The folder.
+    """
+    now = datetime.datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
+    for number in range(1, 10_000):
+        path = Path("runs") / f"{name}-{now}{f'-{number}' if number > 1 else ''}"
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return str(path)
+    raise UserError(f"`runs/{name}-{now}` and what follows it are taken.")
+
+
+OmegaConf.register_new_resolver("run_folder", _run_folder, use_cache=True, replace=True)
+
+
+# The command line -----------------------------------------------------------------------------
+
+
+def run_command(main: Callable[[], None]) -> None:
+    """Run a command of recipes/; leave with status 2 and one line where the user can mend it.
+
+    Args:
+        main: decorated by ``hydra.main``.
+    """
+    # Hydra hands errors on instead of printing them; where the user wants tracebacks, we do too.
+    wanted = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    if wanted:
+        main()
+    elif status := explained(main):
+        sys.exit(status)
+
+
+def explained(job: Callable[[], int | None]) -> int:
+    """Run a job; turn what the user can mend into one line on standard error.
+
+    Args:
+        job: returns an exit status, or None for 0.
+
+    Returns:
+        The job's status, or 2 for an error of the user's.
+    """
+    try:
+        return job() or 0
+    # Such as an agent without its sensors, whose learned model then runs open loop.
+    except (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException) as error:
+        sys.stderr.write(f"error: {explain(error)}\n")
+        return _USER_ERROR
+
+
+def explain(error: BaseException) -> str:
+    """Turn an error into one line; an unknown name gets the nearest one that there is.
+
+    Args:
+        error: of Hydra, or our own.
+
+    Returns:
+        The line.
+    """
+    text = str(error)
+    if found := re.search(
+        r"Could not (?:override|append to config\. An item is .*?|delete.*?) ?'([^']+)'", text
+    ):
+        name = found[1]
+        return f"`{name}` is no setting: {_nearest(name, _names())}"
+    if found := re.search(r"Could not find '([^']+)'", text):
+        group, _, name = found[1].rpartition("/")
+        options = re.findall(r"^\t(\S+)$", text, re.MULTILINE)
+        return f"`{group}={name}` is no choice: {_nearest(name, options)}"
+    if found := re.search(r"[Mm]issing mandatory value: (\S+)", text):
+        return f"`{found[1]}` must be given."
+    return one_line(error)
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, in one line of at most 400 characters.
+
+    Args:
+        error: any.
+
+    Returns:
+        The line.
+    """
+    text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+    return (" ".join(text.split()) or type(error).__name__)[:400]
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    found = difflib.get_close_matches(name, names, 1, 0.5)
+    return f"did you mean `{found[0]}`?" if found else f"there are {', '.join(sorted(names))}."
+
+
+def _names() -> list[str]:
+    """Return every group and every dotted key of the training configuration."""
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        keys = [key for key, _ in _leaves(hydra.compose("config"))]
+    parents = {key[:i] for key in keys for i in range(len(key)) if key[i] == "."}
+    return sorted({*keys, *parents, *(path.name for path in CONF.iterdir() if path.is_dir())})
+
+
+def command_line() -> list[str]:
+    """Return the overrides of the job that Hydra runs."""
+    return list(HydraConfig.get().overrides.task)

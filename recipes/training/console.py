@@ -1,90 +1,30 @@
-"""What a person sees: one progress bar, one line at the end, one line for an error."""
+"""What a person sees and how he stops a run: lines, progress, Ctrl-C."""
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from collections.abc import Callable, Mapping
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_drbpn import BeliefDivergedError
-from training.errors import UserError
-
-_USER_ERROR = 2
-
-
-class ProgressBar:
-    """Show frames, return, realised missing ratio, log-likelihood, speed, time left.
-
-    Args:
-        total_frames: environment steps of the whole run.
-        frames: environment steps already taken.
-    """
-
-    def __init__(self, total_frames: int, frames: int) -> None:
-        self._bar = tqdm(
-            total=total_frames,
-            initial=frames,
-            unit="step",
-            unit_scale=True,
-            dynamic_ncols=True,
-            smoothing=0.1,
-            mininterval=1.0,
-        )
-
-    def __enter__(self) -> ProgressBar:
-        """Show the bar."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Leave the bar where it is."""
-        self._bar.close()
-
-    def update(self, row: Mapping[str, Any]) -> None:
-        """Show the numbers of a rollout.
-
-        Args:
-            row: as logged.
-        """
-        shown = (
-            ("return", "return", "{:.1f}"),
-            ("missing", "missing_ratio", "{:.3f}"),
-            ("log-lik", "log_likelihood", "{:.2f}"),
-            ("steps/s", "steps_per_second", "{:.0f}"),
-        )
-        texts = [
-            f"{name} {form.format(row[key])}"
-            for name, key, form in shown
-            if row.get(key) is not None
-        ]
-        self._bar.set_postfix_str(", ".join(texts), refresh=False)
-        self._bar.update(row["frames"] - self._bar.n)
-
-    def say(self, text: str) -> None:
-        """Print a line above the bar.
-
-        Args:
-            text: the line.
-        """
-        self._bar.write(text)
-
 
 def say(text: str) -> None:
-    """Print a line.
+    """Print a line; nobody has to be listening.
 
     Args:
         text: the line.
     """
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # What is written later, and at the end of the process, goes nowhere too.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def start(run: Callable[[dict[str, Any]], int], config: DictConfig) -> None:
@@ -94,24 +34,75 @@ def start(run: Callable[[dict[str, Any]], int], config: DictConfig) -> None:
         run: the command, on a plain configuration.
         config: what Hydra composed.
     """
-    plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    status = run_or_explain(lambda: run(plain))
+    status = run(cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)))
     if status:
         sys.exit(status)
 
 
-def run_or_explain(job: Callable[[], int]) -> int:
-    """Run a job; turn what the user can mend into one line on standard error.
+def show(bar: tqdm[Any], row: Mapping[str, Any]) -> None:
+    """Show frames, return, realised missing ratio, log-likelihood and speed in a progress bar.
 
     Args:
-        job: returns an exit status.
-
-    Returns:
-        The job's status, or 2 for an error of the user's.
+        bar: the bar.
+        row: numbers of a rollout.
     """
-    try:
-        return job()
-    # Such as an agent without its sensors, whose learned model then runs open loop.
-    except (UserError, BeliefDivergedError) as error:
-        sys.stderr.write(f"error: {error}\n")
-        return _USER_ERROR
+    shown = (
+        ("return", "return", "{:.1f}"),
+        ("missing", "missing_ratio", "{:.3f}"),
+        ("log-lik", "log_likelihood", "{:.2f}"),
+        ("steps/s", "steps_per_second", "{:.0f}"),
+    )
+    texts = [f"{n} {form.format(row[key])}" for n, key, form in shown if row.get(key) is not None]
+    bar.set_postfix_str(", ".join(texts), refresh=False)
+    bar.update(row["frames"] - bar.n)
+
+
+class StopRequest:
+    """Remember that a signal asked the run to stop, while this context is open.
+
+    The first signal is remembered and nothing else happens, so that the run stops where its state
+    is whole: after the update of the current rollout. A second one ends the process as usual.
+
+    Args:
+        patient: whether a second one is ignored instead.
+    """
+
+    def __init__(self, *, patient: bool = False) -> None:
+        self.patient = patient
+        self.signal: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        """Take over both signals."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._remember)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Give both signals back."""
+        self._restore()
+
+    def __bool__(self) -> bool:
+        """Return whether a stop was asked for."""
+        return self.signal is not None
+
+    @property
+    def exit_code(self) -> int:
+        """Return the shell's status for the signal: 130 for Ctrl-C, 143 for SIGTERM, else 0."""
+        return 0 if self.signal is None else 128 + self.signal
+
+    def _remember(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        self.signal = number
+        if not self.patient:
+            self._restore()
+
+    def _restore(self) -> None:
+        while self._before:
+            number, handler = self._before.popitem()
+            signal.signal(number, handler)

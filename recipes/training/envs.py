@@ -1,82 +1,43 @@
-"""The environment of a run: simulators, corruption, normalisation, in the order they need."""
+"""The environment of a run: simulators, and what happens to their observations, in conf's order."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any
 
 import gymnasium
-from torchrl.envs import (
-    Compose,
-    InitTracker,
-    RewardSum,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-)
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
 
-from torchrl_drbpn import (
-    MaskedObservationNorm,
-    ObservationMissingness,
-    ObservationNoise,
-    ObservationSpikes,
-    PreviousAction,
-    RunningReturnScale,
-    SensorOutages,
-    seed_env,
-)
+from torchrl_drbpn import ObservationNoise, ObservationSpikes, SensorOutages, seed_env
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
-from training.config import (
-    EnvSettings,
-    MissingnessSettings,
-    NoiseSettings,
-    NormalisationSettings,
-)
+from training.config import build, one_line
 from training.errors import UserError
-from training.sensor_groups import sensor_groups
-from training.sensors import sensor_names
+from training.sensors import named_sensors, sensor_groups
 
-_MECHANISMS: dict[str, Literal["mcar", "mar", "nmar"]] = {
-    "mcar": "mcar",
-    "mar": "mar",
-    "nmar": "nmar",
-}
-
-_BACKENDS: dict[str, type[EnvPoolBatchEnv] | type[GymnasiumBatchEnv]] = {
-    "gymnasium": GymnasiumBatchEnv,
-    "envpool": EnvPoolBatchEnv,
-}
+# Written by the environment on request, read by a critic on request, by a policy never.
+COMPLETE = "complete_observation"
 
 
-def make_environment(
-    env: EnvSettings,
-    missingness: MissingnessSettings,
-    noise: NoiseSettings,
-    normalisation: NormalisationSettings,
+def make_env(
+    config: DictConfig,
     *,
-    num_envs: int,
-    num_threads: int,
-    gamma: float,
-    seed: int,
-    before_normalisation: Sequence[Transform] = (),
-    after_normalisation: Sequence[Transform] = (),
-    complete: bool = False,
+    num_envs: int | None = None,
+    seed: int | None = None,
+    transforms: Mapping[str, Transform] | None = None,
+    complete: bool | None = None,
 ) -> TransformedEnv:
-    """Build the batched, corrupted, normalised environment of a run.
+    """Build the batched, corrupted environment of a run.
 
     Args:
-        env: which robot.
-        missingness: which entries of an observation do not arrive.
-        noise: what is added to the entries that arrive.
-        normalisation: clips of the running statistics.
-        num_envs: simulators in the batch.
-        num_threads: threads that step them; results do not depend on it.
-        gamma: discount of the return whose deviation scales the reward.
-        seed: seed of episodes and corruption.
-        before_normalisation: further transforms that take entries away.
-        after_normalisation: further transforms that a belief module asks for.
-        complete: whether to write ``complete_observation`` too: what complete, noiseless sensors
-            would have shown, normalised with the same statistics. No policy reads it.
+        config: of the run.
+        num_envs: simulators in the batch; None: as in training.
+        seed: of episodes and corruption; None: the run's.
+        transforms: by their names in ``config.transforms``, in the place of what stands there.
+        complete: whether to write ``complete_observation``, what complete, noiseless sensors would
+            have shown; None: where the critic reads it.
 
     Returns:
         The environment, batch size ``(num_envs,)``. The recurrent state's primer is not in it:
@@ -85,115 +46,139 @@ def make_environment(
     Raises:
         UserError: if the environment does not exist or has unsuitable actions or observations.
     """
-    base = _make_base(env, num_envs, num_threads)
-    transforms: list[Transform] = [PreviousAction()]
-    # The first transform that corrupts writes down what it was given.
-    key = "complete_observation" if complete else None
-    if noise.sigma > 0:
-        transforms.append(ObservationNoise(noise.scale * noise.sigma, complete_key=key))
-        key = None
-    if noise.spike_probability > 0:
-        spikes = ObservationSpikes(noise.spike_probability, noise.spike_std, complete_key=key)
-        transforms.append(spikes)
-        key = None
-    transforms += [
-        make_missingness(env, missingness, base.observation_spec["observation"].shape[-1], key),
-        *before_normalisation,
-        MaskedObservationNorm(clip=normalisation.observation_clip),
-        *after_normalisation,
-        RunningReturnScale(
-            gamma=gamma,
-            clip=normalisation.reward_clip,
-            in_keys=["reward"],
-            out_keys=["scaled_reward"],
-        ),
-        RewardSum(in_keys=["reward"], out_keys=["episode_reward"]),
-        StepCounter(),
-        InitTracker(),
-    ]
-    out = TransformedEnv(base, Compose(*transforms))
-    seed_env(out, seed)
-    return out
+    own = {} if num_envs is None else {"num_envs": num_envs}
+    base: EnvBase = build("env", config.env, **own)
+    replaced = dict(transforms or {})
+    if config.heads.get("critic_input") == "complete" if complete is None else complete:
+        replaced["complete"] = RenameTransform(["observation"], [COMPLETE], create_copy=True)
+    made: list[Transform] = []
+    for name, node in config.transforms.items():
+        nodes = [replaced[name]] if name in replaced else _as_list(node)
+        label = (
+            name if OmegaConf.is_interpolation(config.transforms, name) else f"transforms.{name}"
+        )
+        for part in nodes:
+            if not isinstance(part, Transform):
+                part = build(label, part)
+            made += part if isinstance(part, list) else [part]
+    env = TransformedEnv(base, Compose(*made))
+    seed_env(env, config.seed if seed is None else seed)
+    return env
 
 
-def make_missingness(
-    env: EnvSettings, missingness: MissingnessSettings, obs_dim: int, complete_key: str | None
-) -> Transform:
-    """Build the transform that takes entries away; it writes ``observed`` in every case.
+def _as_list(node: Any) -> list[Any]:
+    if node is None:
+        return []
+    return [node] if isinstance(node, (Mapping, DictConfig)) else list(node)
+
+
+def make_simulators(
+    *,
+    id: str,
+    version: str | None,
+    num_envs: int,
+    num_threads: int,
+    backend: str,
+    kwargs: Mapping[str, Any],
+) -> EnvBase:
+    """Build many simulators of a Gymnasium task.
 
     Args:
-        env: which robot; its sensors' names say what fails together.
-        missingness: which entries do not arrive.
-        obs_dim: components of an observation.
-        complete_key: where the complete observation is recorded; None: nowhere.
+        id: Gymnasium's, without the version where ``version`` holds it.
+        version: such as ``v5``, or None.
+        num_envs: how many.
+        num_threads: threads that step them; results do not depend on it.
+        backend: ``gymnasium`` or ``envpool``.
+        kwargs: of the task.
+
+    Returns:
+        The environment.
+
+    Raises:
+        UserError: if it does not exist or has unsuitable actions or observations.
+    """
+    backends = {"gymnasium": GymnasiumBatchEnv, "envpool": EnvPoolBatchEnv}
+    if backend not in backends:
+        raise UserError(f"`env.backend` must be gymnasium or envpool, got {backend!r}.")
+    name = f"{id}-{version}" if version else id
+    try:
+        return backends[backend](name, num_envs, num_threads=num_threads, **kwargs)
+    except (ValueError, TypeError, ModuleNotFoundError, gymnasium.error.Error) as error:
+        raise UserError(f"`env.id={name}`: {one_line(error)}") from error
+
+
+def env_name(config: DictConfig) -> str:
+    """Return the whole Gymnasium id of a run's task, such as ``Walker2d-v5``.
+
+    Args:
+        config: of the run.
+    """
+    env = config.env
+    return f"{env.id}-{env.version}" if env.version else str(env.id)
+
+
+def make_noise(
+    *, sigma: float, scale: float, spike_probability: float = 0.0, spike_std: float = 0.0
+) -> list[Transform]:
+    """Make what is added to the entries that arrive.
+
+    Args:
+        sigma: standard deviation of white noise in units of ``scale``.
+        scale: raw simulator units.
+        spike_probability: of a large error, an entry and step.
+        spike_std: standard deviation of that error, raw simulator units.
+
+    Returns:
+        The transforms, none where nothing is added.
+    """
+    made: list[Transform] = []
+    if sigma != 0:
+        made.append(ObservationNoise(scale * sigma))
+    if spike_probability != 0:
+        made.append(ObservationSpikes(spike_probability, spike_std))
+    return made
+
+
+def make_outages(
+    *, eta: float, mean_length: float, group_by: str, id: str, version: str | None
+) -> SensorOutages:
+    """Make sensors fail for a while, alone or together.
+
+    Args:
+        eta: long-run share of the steps that a sensor is off.
+        mean_length: of an outage, steps.
+        group_by: what fails together: ``sensor``, ``joint`` or ``kind``.
+        id: task whose sensors have names to group by.
+        version: of the task.
 
     Returns:
         The transform.
     """
-    if missingness.mechanism == "outages":
-        return SensorOutages(
-            missingness.eta,
-            missingness.mean_length,
-            groups=sensor_groups(sensor_names(env.id, env.version, obs_dim), missingness.group_by),
-            complete_key=complete_key,
-        )
-    none = missingness.mechanism == "none"
-    return ObservationMissingness(
-        "mcar" if none else _MECHANISMS[missingness.mechanism],
-        0.0 if none else missingness.eta,
-        always_observed=missingness.always_observed,
-        mechanism_seed=missingness.mechanism_seed,
-        complete_key=complete_key,
+    return SensorOutages(
+        eta, mean_length, groups=sensor_groups(named_sensors(id, version), group_by)
     )
 
 
-def task_dims(env: EnvSettings) -> tuple[int, int]:
-    """Return the sizes of a task.
+def make_collector(
+    env: TransformedEnv, policy: TensorDictModuleBase, *, num_envs: int, steps_per_env: int
+) -> Collector:
+    """Make TorchRL's collector of one rollout after the other.
 
     Args:
-        env: which robot.
+        env: batch size ``(num_envs,)``.
+        policy: what acts.
+        num_envs: simulators.
+        steps_per_env: of a rollout.
 
     Returns:
-        Components of an observation and of an action.
-
-    Raises:
-        UserError: if the environment does not exist or has unsuitable actions or observations.
+        The collector.
     """
-    base = _make_base(env, 1, 1)
-    dims = base.observation_spec["observation"].shape[-1], base.action_spec.shape[-1]
-    base.close()
-    return dims
-
-
-def _make_base(
-    env: EnvSettings, num_envs: int, num_threads: int
-) -> EnvPoolBatchEnv | GymnasiumBatchEnv:
-    """Build the simulators; what can't be used is the user's to mend."""
-    try:
-        return _BACKENDS[env.backend](env.env_id, num_envs, num_threads=num_threads)
-    except (ValueError, ModuleNotFoundError, gymnasium.error.Error) as error:
-        raise UserError(" ".join(str(error).split())) from error
-
-
-def normalisers(env: TransformedEnv) -> list[Transform]:
-    """Return the transforms of an environment that learn statistics.
-
-    Args:
-        env: the environment.
-
-    Returns:
-        Its observation and reward normalisers.
-    """
-    return [t for t in env.transform if isinstance(t, (MaskedObservationNorm, RunningReturnScale))]
-
-
-def copy_statistics(source: TransformedEnv, target: TransformedEnv) -> None:
-    """Give an environment the frozen statistics of another.
-
-    Args:
-        source: the environment that learned them.
-        target: the environment that uses them; it learns no more.
-    """
-    for learned, frozen in zip(normalisers(source), normalisers(target), strict=True):
-        frozen.load_state_dict(learned.state_dict())
-        frozen.freeze()
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=num_envs * steps_per_env,
+        total_frames=-1,
+        track_traj_ids=False,
+        use_buffers=True,
+        auto_register_policy_transforms=False,
+    )

@@ -1,84 +1,154 @@
-"""What a run leaves on disk: configuration, versions, tables."""
+"""What a run leaves on disk: configuration, versions, tables, and a lock while it lasts."""
 
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from torchrl.record.loggers.common import Logger
 from yaml import YAMLError
 
+from training.config import build
 from training.errors import UserError
 
 _PACKAGES = (
-    "torch",
-    "torchrl",
-    "tensordict",
-    "gymnasium",
-    "mujoco",
-    "envpool",
-    "numpy",
-    "hydra-core",
+    *("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "envpool", "numpy", "hydra-core"),
+    "torchrl_drbpn",
 )
-
-# Of a run that recipes/study.py started: which cell of which study it is.
-CELL_FILE = "cell.json"
-
+_MAY_CHANGE = ("total_frames", "logger", "evaluation")  # with resume=
 # Of evaluation.csv: one row an evaluation and kind of action.
 EVALUATION_COLUMNS = (
-    "frames",
-    "kind",
-    "mode",
-    "episodes",
-    "return_mean",
-    "return_std",
-    "length_mean",
-    "missing_ratio",
-    "log_likelihood",
+    *("frames", "kind", "mode", "episodes", "return_mean", "return_std", "length_mean"),
+    *("missing_ratio", "log_likelihood"),
+)
+_METRICS = (
+    *("frames", "episodes", "return", "missing_ratio", "log_likelihood", "loss_objective"),
+    *("loss_critic", "loss_entropy", "loss_model", "kl", "clip_fraction", "ess"),
+    *("explained_variance", "grad_norm", "action_std", "lr"),
 )
 
-# Settings that came after the first run folders, with the value that says what a run without them
-# did: a folder stays readable when a setting is added. "group.key": value
-_LATER_SETTINGS: dict[str, Any] = {
-    "algo": {"_target_": "algorithms.ppo.build", "name": "ppo"},
-    "heads.critic_input": "features",
-    "optim.recompute_advantages": False,
-    "missingness.mean_length": 1.0,
-    "missingness.group_by": "sensor",
-    "noise.spike_probability": 0.0,
-    "noise.spike_std": 0.0,
-    "method": None,
-}
+
+# Files ----------------------------------------------------------------------------------------
 
 
-def write_config(folder: Path, config: Mapping[str, Any]) -> None:
-    """Write the resolved configuration of a run.
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file whole or not at all.
+
+    Args:
+        path: the file.
+        text: its content.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a CSV file whole or not at all.
+
+    Args:
+        path: the file.
+        rows: its rows, at least one, all with the same keys.
+    """
+    write_whole(path, _csv_text(list(rows[0]), rows))
+
+
+def _csv_text(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
+    file = io.StringIO()
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()
+
+
+class Table:
+    """Append rows to a CSV file; a resumed run goes on where its checkpoint was.
+
+    Args:
+        path: the file.
+        columns: its columns; the first is ``frames``.
+        up_to_frames: rows after this many frames are dropped; None: nothing is there yet.
+
+    Raises:
+        UserError: if what is there is no such table.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], up_to_frames: int | None = None) -> None:
+        self.path, self.columns = path, list(columns)
+        kept: list[dict[str, str]] = []
+        if up_to_frames is not None and path.exists():
+            try:
+                with path.open(newline="", encoding="utf-8") as file:
+                    kept = list(self._whole_rows(csv.DictReader(file), up_to_frames))
+            except (OSError, UnicodeDecodeError, csv.Error) as error:
+                raise UserError(f"`{path}` can't be read as a table: is it damaged?") from error
+        write_whole(path, _csv_text(self.columns, kept))
+
+    def _whole_rows(self, rows: csv.DictReader[str], frames: int) -> Iterator[dict[str, str]]:
+        if "frames" not in (rows.fieldnames or ()):
+            raise UserError(f"`{self.path}` must begin with the names of its columns: damaged?")
+        for row in rows:
+            try:
+                # A row that was being written when the machine stopped has no end.
+                whole = None not in row.values() and int(row["frames"]) <= frames
+            except ValueError:
+                whole = False
+            if whole:
+                yield {c: row.get(c, "") for c in self.columns}
+
+    def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Append rows.
+
+        Args:
+            rows: values by column; an absent one or None is an empty cell, others are left out.
+        """
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self.columns, lineterminator="\n")
+            writer.writerows({c: row.get(c) for c in self.columns} for row in rows)
+
+
+def is_evaluated(folder: Path, config: DictConfig) -> bool:
+    """Return whether a run has its final evaluation, as its configuration asks for it.
 
     Args:
         folder: the run folder.
-        config: the configuration as plain containers.
+        config: of the run.
     """
-    write_whole(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+    wanted = config.evaluation
+    path = folder / "evaluation.csv"
+    if not wanted.final_episodes:
+        return True
+    if not path.is_file():
+        return False
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        done = {
+            row.get("mode")
+            for row in csv.DictReader(file)
+            if row.get("kind") == "final" and row.get("episodes") == str(wanted.final_episodes)
+        }
+    return set(wanted.modes) <= done
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """Read the configuration of a run.
+def load_config(folder: Path) -> DictConfig:
+    """Read the configuration of a run, to build its parts anew.
 
     Args:
         folder: the run folder.
 
     Returns:
-        The configuration as plain containers; settings that came after it was written are added
-        with the value that describes it.
+        The configuration, as it was composed.
 
     Raises:
         UserError: if there is none, or it can't be read.
@@ -87,24 +157,80 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise UserError(f"`{folder}` must be a run folder with config.yaml; there is none.")
     try:
-        config = OmegaConf.to_container(OmegaConf.load(path))
-    except (YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        config = OmegaConf.load(path)
+    except (YAMLError, OmegaConfBaseException, UnicodeDecodeError, OSError) as error:
         raise UserError(f"`{path}` can't be read as a configuration: is it damaged?") from error
-    if not isinstance(config, dict):
-        raise UserError(f"`{path}` must hold the settings of a run, got {type(config).__name__}.")
-    return _with_later_settings({str(key): value for key, value in config.items()})
-
-
-def _with_later_settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Give an older configuration the settings that came later, at the value it had acted on."""
-    for name, value in _LATER_SETTINGS.items():
-        *path, last = name.split(".")
-        group: Any = config
-        for part in path:
-            group = group.setdefault(part, {}) if isinstance(group, dict) else None
-        if isinstance(group, dict):
-            group.setdefault(last, value)
+    if not isinstance(config, DictConfig) or "env" not in config:
+        raise UserError(f"`{path}` must hold the settings of a run: is it another program's?")
+    if OmegaConf.select(config, "env._target_") is None:
+        raise UserError(
+            f"`{path}` can't be read: it is of version 0.1.0, which the code of commit 2ebd861 "
+            "reads."
+        )
     return config
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Read the configuration of a run, for tables.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        The configuration, resolved, as plain containers.
+
+    Raises:
+        UserError: if there is none, or it can't be read.
+    """
+    plain = OmegaConf.to_container(load_config(folder), resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def resumed_config(composed: DictConfig, overrides: Sequence[str], folder: Path) -> DictConfig:
+    """Return the configuration of a run that is continued.
+
+    A larger ``total_frames`` also stretches what is left of the linear learning rate schedule: the
+    run then differs from one that was given the larger number from the start.
+
+    Args:
+        composed: the configuration that the command line gives.
+        overrides: the words of the command line, such as ``total_frames=2_000_000``.
+        folder: the run folder.
+
+    Returns:
+        The folder's configuration with the overrides that are allowed.
+
+    Raises:
+        UserError: if the folder is no run folder, or another setting was given.
+    """
+    config = load_config(folder)
+    for word in overrides:
+        name = word.split("=", 1)[0].lstrip("+~")
+        group = name.split(".", 1)[0]
+        if name == "hydra.run.dir":
+            raise UserError(f"`resume` names the run folder already; leave out {word!r}.")
+        if group in ("resume", "hydra"):
+            continue
+        if group not in _MAY_CHANGE:
+            raise UserError(
+                f"`resume` continues a run with its own settings; only {', '.join(_MAY_CHANGE)} "
+                f"may be given with it, got {word!r}."
+            )
+        OmegaConf.update(config, name, OmegaConf.select(composed, name), merge=False)
+    config.resume = str(folder)
+    return config
+
+
+def write_config(folder: Path, config: DictConfig) -> None:
+    """Write the configuration of a run, as it was composed.
+
+    Args:
+        folder: the run folder.
+        config: the configuration.
+    """
+    kept = OmegaConf.merge(config, {"resume": None})
+    write_whole(folder / "config.yaml", OmegaConf.to_yaml(kept))
 
 
 def write_versions(folder: Path) -> None:
@@ -115,7 +241,7 @@ def write_versions(folder: Path) -> None:
     """
     system = f"{platform.system()} {platform.machine()}"
     versions = {"python": platform.python_version(), "platform": system}
-    for name in (*_PACKAGES, "torchrl_drbpn"):
+    for name in _PACKAGES:
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
@@ -141,66 +267,88 @@ def _git(*arguments: str) -> str:
     return answer.stdout.strip()
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file whole or not at all.
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Make a folder and keep every other run out of it until the end.
 
     Args:
-        path: the file.
-        text: its content.
+        folder: the run folder.
+
+    Raises:
+        UserError: if another run is in it, or it can't be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / ".lock").open("w")
+    except OSError as error:
+        raise UserError(f"`{folder}` can't be a run folder: {error.strerror}.") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise UserError(f"`{folder}` is in use by a run that has not ended.") from error
+        yield
 
 
-class Table:
-    """Append rows to a CSV file; a resumed run goes on where its checkpoint was.
+# Numbers --------------------------------------------------------------------------------------
+
+
+def metric_columns(more: Iterable[str]) -> list[str]:
+    """Return the columns of metrics.csv, frames first, times last.
 
     Args:
-        path: the file.
-        columns: its columns; the first is ``frames``.
-        up_to_frames: rows after this many frames are dropped; None: nothing is there yet.
+        more: those that the belief adds.
+    """
+    return [*_METRICS, *more, "steps_per_second", "wall_time"]
+
+
+class RunLog:
+    """Tables and logger of a run.
+
+    Args:
+        folder: the run folder.
+        config: of the run.
+        columns: of metrics.csv beside the usual ones.
+        frames: at which it goes on; None: it starts.
+        evaluated_frames: of its last evaluation.
     """
 
-    def __init__(self, path: Path, columns: Sequence[str], up_to_frames: int | None = None) -> None:
-        self.path, self.columns = path, list(columns)
-        kept: list[dict[str, str]] = []
-        if up_to_frames is not None and path.is_file():
-            with path.open(newline="", encoding="utf-8") as file:
-                for row in csv.DictReader(file):
-                    try:
-                        # A row that was being written when the machine stopped has no end.
-                        whole = None not in row.values() and int(row["frames"]) <= up_to_frames
-                    except (KeyError, ValueError):
-                        whole = False
-                    if whole:
-                        kept.append({c: row.get(c, "") for c in self.columns})
-        write_whole(path, _csv_text(self.columns, kept))
+    def __init__(
+        self,
+        folder: Path,
+        config: DictConfig,
+        columns: Iterable[str],
+        frames: int | None,
+        evaluated_frames: int | None,
+    ) -> None:
+        self.logger: Logger = build("logger", config.logger, logger_name=str(folder))
+        self.metrics = Table(folder / "metrics.csv", metric_columns(columns), frames)
+        self.episodes = Table(folder / "episodes.csv", ("frames", "return", "length"), frames)
+        # Evaluations that the checkpoint does not know of are made again, the final one included.
+        self.evaluations = Table(folder / "evaluation.csv", EVALUATION_COLUMNS, evaluated_frames)
 
-    def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Append rows.
+    def rollout(self, row: Mapping[str, Any], finished: Sequence[Mapping[str, Any]]) -> None:
+        """Log a rollout.
 
         Args:
-            rows: values by column; an absent one or None is an empty cell, others are left out.
+            row: its numbers by column.
+            finished: a row for each episode that ended in it.
         """
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self.columns, lineterminator="\n")
-            writer.writerows({c: row.get(c) for c in self.columns} for row in rows)
+        self.metrics.append([row])
+        self.episodes.append(finished)
+        self._scalars("train", row)
 
+    def evaluation(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Log an evaluation.
 
-def _csv_text(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
-    file = io.StringIO()
-    writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return file.getvalue()
+        Args:
+            rows: one a kind of action.
+        """
+        self.evaluations.append(rows)
+        for row in rows:
+            self._scalars(f"evaluation_{row['mode']}", row)
 
-
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV file whole or not at all.
-
-    Args:
-        path: the file.
-        rows: its rows, at least one, all with the same keys.
-    """
-    write_whole(path, _csv_text(list(rows[0]), rows))
+    def _scalars(self, prefix: str, row: Mapping[str, Any]) -> None:
+        for key, value in row.items():
+            if isinstance(value, (int, float)) and key != "frames":
+                self.logger.log_scalar(f"{prefix}/{key}", value, step=row["frames"])

@@ -1,12 +1,12 @@
-"""No belief: the heads read the observation as it arrived."""
+"""No belief: the heads read the observation as it arrived, or with its gaps filled (FA-PPO)."""
 
 from __future__ import annotations
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
-from beliefs import Belief
+from beliefs import ESTIMATE, OBSERVATION, Belief
 
 
 class ObservationFeatures(nn.Module):
@@ -35,20 +35,39 @@ class ObservationFeatures(nn.Module):
         return observation
 
 
-def build(*, obs_dim: int, action_dim: int, normalize: str, with_mask: bool) -> Belief:
+def build(*, obs_dim: int, action_dim: int, with_mask: bool) -> Belief:
     """Build the absence of a belief.
 
     Args:
         obs_dim: components of an observation.
         action_dim: components of an action; unused.
-        normalize: unused, there is no model.
         with_mask: whether the heads also read which entries arrived.
 
     Returns:
         The belief.
     """
-    del action_dim, normalize
+    del action_dim
     module = TensorDictModule(
-        ObservationFeatures(with_mask), in_keys=["observation", "observed"], out_keys=["features"]
+        ObservationFeatures(with_mask), in_keys=[OBSERVATION, "observed"], out_keys=["features"]
     )
     return Belief(module, obs_dim * (2 if with_mask else 1))
+
+
+def build_filled(*, obs_dim: int, action_dim: int, with_mask: bool) -> Belief:
+    """Build a feed-forward policy on filled observations: conf fills and normalises them.
+
+    Args:
+        obs_dim: components of an observation.
+        action_dim: components of an action; unused.
+        with_mask: whether the heads also read which entries arrived.
+
+    Returns:
+        The belief; what it holds of a missing sensor is what it was filled with.
+    """
+    plain = build(obs_dim=obs_dim, action_dim=action_dim, with_mask=with_mask)
+    filled = TensorDictModule(nn.Identity(), in_keys=[OBSERVATION], out_keys=[ESTIMATE])
+    return Belief(
+        plain.module,
+        plain.feature_dim,
+        observing=lambda: TensorDictSequential(plain.module, filled),
+    )

@@ -1,0 +1,63 @@
+"""Evaluation of the agent of a run while it trains, and at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from evaluation.episodes import Episodes, evaluate, make_evaluation_environment
+from omegaconf import DictConfig
+from torchrl.envs import TransformedEnv
+
+from training.state import Training
+
+
+def evaluate_training(
+    config: DictConfig,
+    training: Training,
+    kind: str,
+    episodes: int,
+    stop: Callable[[], bool],
+) -> list[dict[str, Any]] | None:
+    """Evaluate the agent of a run as it is now; nothing of the training changes.
+
+    Args:
+        config: of the run.
+        training: the run.
+        kind: ``training`` or ``final``.
+        episodes: of each kind of action.
+        stop: asked at every step; if it returns True the evaluation is given up.
+
+    Returns:
+        A row for each kind of action, see :data:`training.run_folder.EVALUATION_COLUMNS`; None
+        where it was given up.
+    """
+
+    def make_env(_: int) -> TransformedEnv:
+        return make_evaluation_environment(config, training.agent)
+
+    rows = []
+    for mode in config.evaluation.modes:
+        result = evaluate(
+            training.agent.policy,
+            make_env,
+            episodes=episodes,
+            mode=mode,
+            seed=config.evaluation.seed,
+            stop=stop,
+        )
+        if result is None:
+            return None
+        rows.append({"frames": training.frames, "kind": kind, "mode": mode} | _numbers(result))
+    return rows
+
+
+def _numbers(result: Episodes) -> dict[str, Any]:
+    return {
+        "episodes": len(result.returns),
+        "return_mean": result.mean_return,
+        "return_std": result.std_return,
+        "length_mean": sum(result.lengths) / len(result.lengths),
+        "missing_ratio": result.missing_ratio,
+        "log_likelihood": result.log_likelihood,
+    }

@@ -1,0 +1,367 @@
+"""Clipped PPO and the likelihood of the belief's model: loss, advantages, minibatches, steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives.value import GAE
+
+from torchrl_drbpn import BeliefModelLoss, DRBPNLoss
+from training.agent import Agent
+from training.errors import DivergedError
+
+_ESTIMATES = ("advantage", "value_target", "state_value")
+_NAMES = {"kl_approx": "kl", "ESS": "ess"}
+
+
+def make_loss(
+    agent: Agent,
+    *,
+    clip_epsilon: float,
+    critic_coeff: float,
+    loss_critic_type: str,
+    entropy_coeff: float,
+    normalize_advantage: bool,
+    model_coeff: float,
+    normalize: Literal["entry", "step"],
+    detach_belief: bool,
+) -> LossModule:
+    """Build the loss: PPO and, where the belief has a likelihood, that of what arrived.
+
+    Args:
+        agent: whose belief module, actor and critic it trains.
+        clip_epsilon: of the probability ratio.
+        critic_coeff: weight of the value loss.
+        loss_critic_type: ``l1``, ``l2`` or ``smooth_l1``.
+        entropy_coeff: weight of the entropy bonus; 0 leaves it out.
+        normalize_advantage: over each minibatch.
+        model_coeff: weight of minus the log-likelihood.
+        normalize: what the likelihood is divided by, ``entry`` or ``step``.
+        detach_belief: whether PPO's gradient is kept out of the belief module.
+
+    Returns:
+        A loss whose outputs named ``loss*`` are to be summed.
+    """
+    ppo = ClipPPOLoss(
+        agent.actor,
+        agent.critic,
+        clip_epsilon=clip_epsilon,
+        entropy_bonus=entropy_coeff > 0,
+        entropy_coeff=entropy_coeff,
+        critic_coeff=critic_coeff,
+        loss_critic_type=loss_critic_type,
+        normalize_advantage=normalize_advantage,
+        # The recipe reports it once a rollout; here it is a fifth of the PPO loss.
+        log_explained_variance=False,
+        # The parameters are those of the modules: swapping them in costs a tenth of an update.
+        functional=False,
+    )
+    modelled = ("belief", "log_likelihood") in agent.belief.out_keys
+    return DRBPNLoss(
+        agent.belief,
+        ppo,
+        BeliefModelLoss(normalize=normalize) if modelled else None,
+        model_coeff=model_coeff,
+        detach_belief=detach_belief,
+    )
+
+
+# Advantages -----------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def add_advantages(
+    data: TensorDictBase, agent: Agent, gae: GAE, *, recompute: bool = False
+) -> None:
+    """Write values and advantages into a rollout.
+
+    Where an episode goes on, the belief that follows a step is the one stored at the next step, and
+    so is its value: only where one ends, or the rollout is cut, is there another one to value.
+
+    Args:
+        data: normalised rollout of batch size ``(environments, time)``; changed in place.
+        agent: whose critic values the beliefs.
+        gae: TorchRL's, of values that are there already.
+        recompute: by the current parameters: every belief is taken one step on from the stored one
+            before it. Exact for a belief without memory; with memory, what lies before that step
+            is as old as the beliefs that the sequences of the update start from.
+    """
+    value = agent.one_step_value(data) if recompute else agent.value(data)
+    following = data.get("next")
+    ends = following.get("done").squeeze(-1).clone()
+    ends[:, -1] = True
+    next_value = torch.cat([value[:, 1:], value[:, :1]], 1)
+    next_value[ends] = agent.one_step_value(following, ends)
+    data.set("state_value", value)
+    following.set("state_value", next_value)
+    gae(data)
+
+
+# Minibatches ----------------------------------------------------------------------------------
+
+
+def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorDict:
+    """Cut a rollout into sequences and keep what the loss reads.
+
+    The last step of each environment is marked ``final``: the rollout ends there, so that the
+    observation after it is nobody's root step and its likelihood is counted here. Where sequences
+    are cut from each other nothing is marked.
+
+    Args:
+        data: rollout of batch size ``(environments, time)`` with advantages.
+        loss: the loss that reads the sequences.
+        length: time steps of a sequence; divides the rollout.
+
+    Returns:
+        Contiguous tensors, batch size ``(environments * time / length, length)``.
+    """
+    final = torch.zeros(*data.shape, 1, dtype=torch.bool)
+    final[:, -1] = True
+    tensors: dict[NestedKey, torch.Tensor] = {"final": final}
+    for key in (*loss.in_keys, *_ESTIMATES):
+        value = data.get(key, None)
+        if value is not None:
+            tensors[key] = value
+    rows = data.shape[0] * data.shape[1] // length
+    out = TensorDict({}, batch_size=[rows, length])
+    for key, value in tensors.items():
+        out.set(key, value.reshape(rows, length, *value.shape[2:]).contiguous())
+    return out
+
+
+def minibatches(
+    sequences: TensorDict, count: int, generator: torch.Generator
+) -> Iterator[TensorDictBase]:
+    """Yield the sequences in random order, each once.
+
+    Args:
+        sequences: batch size ``(sequences, time)``.
+        count: minibatches; divides the number of sequences.
+        generator: of the order.
+
+    Yields:
+        Minibatches of batch size ``(sequences / count, time)``.
+    """
+    order = torch.randperm(sequences.shape[0], generator=generator)
+    # One gather an epoch; the minibatches are views of it.
+    yield from sequences[order].split(sequences.shape[0] // count)
+
+
+# Steps ----------------------------------------------------------------------------------------
+
+
+class GradientSteps:
+    """Hold an optimiser and how it steps.
+
+    Args:
+        parameters: what is optimised.
+        optimizer: makes the optimiser of parameters and ``lr``.
+        lr: learning rate of the first rollout; it falls linearly.
+        max_grad_norm: of all parameters together.
+        epochs: passes over a rollout.
+        minibatches: per epoch.
+        sequence_length: time steps of a sequence; 1 where the belief has no memory.
+        recompute_advantages: whether anew, by the current parameters, before every later epoch.
+    """
+
+    def __init__(
+        self,
+        parameters: Iterable[torch.nn.Parameter],
+        *,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        lr: float,
+        max_grad_norm: float,
+        epochs: int,
+        minibatches: int,
+        sequence_length: int,
+        recompute_advantages: bool,
+    ) -> None:
+        self.parameters = list(parameters)
+        self.optimizer = optimizer(self.parameters, lr=lr)
+        self.lr, self.max_grad_norm = lr, max_grad_norm
+        self.epochs, self.minibatches, self.sequence_length = epochs, minibatches, sequence_length
+        self.recompute_advantages = recompute_advantages
+
+    def take(self, loss: torch.Tensor) -> torch.Tensor:
+        """Take one step down a loss.
+
+        Args:
+            loss: a scalar.
+
+        Returns:
+            Norm of the gradient.
+
+        Raises:
+            DivergedError: if it is no finite number.
+        """
+        self.optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+        check_finite({"grad_norm": norm}, "gradient")
+        self.optimizer.step()
+        return norm
+
+
+class PPO:
+    """Take epochs of minibatch steps on one loss over belief, policy and value.
+
+    Args:
+        agent: whose parameters are changed.
+        loss: its outputs named ``loss*`` are summed.
+        steps: on it.
+        gae: estimator of advantages, where they are recomputed.
+        seed: of the order of minibatches.
+    """
+
+    def __init__(
+        self, agent: Agent, *, loss: LossModule, steps: GradientSteps, gae: GAE, seed: int
+    ) -> None:
+        self.agent, self.loss, self.steps, self.gae = agent, loss, steps, gae
+        # Without memory no gradient flows through time: steps drawn one by one depend less on each
+        # other than sequences do, and train better for nothing (docs/reproduction.md).
+        self.sequence_length = steps.sequence_length if agent.recurrent else 1
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def update(self, data: TensorDictBase, remaining: float) -> dict[str, float]:
+        """Take the gradient steps of one rollout.
+
+        Args:
+            data: rollout of batch size ``(environments, time)`` with advantages.
+            remaining: share of the run still to come; the learning rate falls with it.
+
+        Returns:
+            The means of what the loss reports, and the learning rate.
+
+        Raises:
+            DivergedError: if a loss, a gradient or a weight is no finite number.
+        """
+        lr = self.steps.lr * remaining
+        for group in self.steps.optimizer.param_groups:
+            group["lr"] = lr
+        seen: dict[str, list[torch.Tensor]] = {}
+        for sequences in self.cut(data):
+            for minibatch in minibatches(sequences, self.steps.minibatches, self.generator):
+                for key, value in self.step(minibatch).items():
+                    seen.setdefault(key, []).append(value.detach())
+        check_finite(dict(self.agent.named_parameters()), "weight")
+        means = {key: torch.stack(values).mean() for key, values in seen.items()}
+        row = {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
+        return {**row, "lr": lr}
+
+    def cut(self, data: TensorDictBase) -> Iterator[TensorDict]:
+        """Yield the sequences of each epoch; advantages are recomputed in place.
+
+        Args:
+            data: rollout of batch size ``(environments, time)`` with advantages.
+
+        Yields:
+            Sequences, batch size ``(environments * time / length, length)``.
+        """
+        sequences = to_sequences(data, self.loss, self.sequence_length)
+        for epoch in range(self.steps.epochs):
+            if epoch and self.steps.recompute_advantages:
+                add_advantages(data, self.agent, self.gae, recompute=True)
+                for key in _ESTIMATES:
+                    sequences.get(key).copy_(data.get(key).reshape(*sequences.shape, 1))
+            yield sequences
+
+    def step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
+        """Take one gradient step.
+
+        Args:
+            minibatch: sequences.
+
+        Returns:
+            What the loss reports, and ``grad_norm``.
+        """
+        terms = dict(self.loss(minibatch).items())
+        losses = {key: value for key, value in terms.items() if key.startswith("loss")}
+        check_finite(losses, "loss")
+        norm = self.steps.take(torch.stack(list(losses.values())).sum())
+        return {**terms, "grad_norm": norm}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the optimiser's state and the generator's: entries of the checkpoint, by name."""
+        return {
+            "optimizer": self.steps.optimizer.state_dict(),
+            "minibatch_generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take up a saved state.
+
+        Args:
+            state: a checkpoint.
+        """
+        self.steps.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["minibatch_generator"])
+
+
+def check_finite(tensors: Mapping[str, torch.Tensor], kind: str) -> None:
+    """Check that tensors hold finite numbers alone.
+
+    Args:
+        tensors: by name.
+        kind: what they are.
+
+    Raises:
+        DivergedError: naming the first that does not.
+    """
+    if torch.stack([value.detach().sum() for value in tensors.values()]).sum().isfinite():
+        return
+    for name, value in tensors.items():
+        wrong = value.detach()[~value.detach().isfinite()]
+        if wrong.numel():
+            raise DivergedError(f"the {kind} `{name}` is {wrong[0].item()}.")
+
+
+# Numbers to log -------------------------------------------------------------------------------
+
+
+def rollout_metrics(data: TensorDictBase) -> dict[str, float | None]:
+    """Return what a rollout says of the sensors, the belief and the value.
+
+    Args:
+        data: rollout with advantages.
+
+    Returns:
+        ``missing_ratio``, over all components; ``log_likelihood``, nats per observed entry of
+        normalised observation, None without a model; ``explained_variance`` of the returns by the
+        values, 0 where they do not vary; ``action_std``.
+    """
+    observed, target = data.get("observed"), data.get("value_target")
+    likelihood = data.get(("belief", "log_likelihood"), None)
+    spread = target.var()
+    left = (target - data.get("state_value")).var() / spread if spread > 0 else spread + 1
+    return {
+        "missing_ratio": 1.0 - observed.to(torch.float64).mean().item(),
+        "log_likelihood": None
+        if likelihood is None
+        else (likelihood.sum() / observed.sum().clamp_min(1)).item(),
+        "explained_variance": (1 - left).item(),
+        "action_std": data.get("scale").mean().item(),
+    }
+
+
+def finished_episodes(data: TensorDictBase, frames: int) -> list[dict[str, Any]]:
+    """Return the episodes that ended in a rollout, in the order of time.
+
+    Args:
+        data: rollout of batch size ``(environments, time)``.
+        frames: environment steps at its end.
+
+    Returns:
+        ``frames``, ``return`` (raw) and ``length`` of each.
+    """
+    # Time first, so that the order does not depend on the environment's place in the batch.
+    done, returns, lengths = (
+        data.get(("next", key)).squeeze(-1).transpose(0, 1)
+        for key in ("done", "episode_reward", "step_count")
+    )
+    pairs = zip(returns[done].tolist(), lengths[done].tolist(), strict=True)
+    return [{"frames": frames, "return": value, "length": length} for value, length in pairs]

@@ -1,0 +1,130 @@
+"""Everything that changes while a run trains, saved and restored."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+from torchrl.objectives.value import GAE
+
+from training.agent import Agent
+from training.checkpoint import carry_over, fitting, set_carry_over
+from training.reward_scale import ReturnStatistics
+
+_RECENT_EPISODES = 100
+
+
+class Algorithm(Protocol):
+    """What training asks of an algorithm."""
+
+    def update(self, data: TensorDictBase, remaining: float) -> dict[str, float]:
+        """Change the agent's parameters after one rollout; return numbers for metrics.csv."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return entries of the checkpoint, by name."""
+
+    def load_state_dict(self, state: Any) -> None:
+        """Take up the entries of :meth:`state_dict`, out of a whole checkpoint."""
+
+
+@dataclass
+class Training:
+    """The parts of a run and its counters.
+
+    Attributes:
+        env: that of the collector.
+        agent: what is trained.
+        collector: collects rollouts by the agent's policy.
+        gae: estimates advantages.
+        algorithm: learns from rollouts.
+        scale_reward: see :func:`training.reward_scale.scale_reward`.
+        reward_statistics: what it remembers.
+        frames: environment steps so far.
+        episodes: finished episodes so far.
+        returns: raw returns of the latest finished episodes.
+        seconds: time in collection and update.
+        evaluated_frames: frames at the last evaluation; -1 before the first one.
+    """
+
+    env: TransformedEnv
+    agent: Agent
+    collector: Collector
+    gae: GAE
+    algorithm: Algorithm
+    scale_reward: Callable[..., tuple[Tensor, ReturnStatistics]]
+    reward_statistics: ReturnStatistics
+    frames: int = 0
+    episodes: int = 0
+    returns: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT_EPISODES))
+    seconds: float = 0.0
+    evaluated_frames: int = -1
+
+    def state_dict(self, *, simulators: bool = True) -> dict[str, Any]:
+        """Return everything that a checkpoint holds, between two rollouts.
+
+        Args:
+            simulators: whether their state is worth keeping; not where they have failed.
+
+        Returns:
+            Tensors, numbers, texts, and containers of them.
+        """
+        keeps = simulators and self.env.base_env.supports_state
+        return {
+            "agent": self.agent.state_dict(),
+            **self.algorithm.state_dict(),
+            "reward_statistics": dict(self.reward_statistics._asdict()),
+            "transforms": self.env.state_dict(),
+            # None where the simulators keep their state to themselves: new episodes start then.
+            "simulators": self.env.base_env.state_dict() if keeps else None,
+            "carrier": carry_over(self.collector) if keeps else None,
+            "torch_generator": torch.get_rng_state(),
+            "progress": {
+                "frames": self.frames,
+                "episodes": self.episodes,
+                "returns": list(self.returns),
+                "train_seconds": self.seconds,
+                "evaluated_frames": self.evaluated_frames,
+            },
+        }
+
+    def load_state_dict(self, state: dict[str, Any], source: str) -> None:
+        """Put a run back to where a checkpoint was written.
+
+        Args:
+            state: from :meth:`state_dict` of a run with the same settings.
+            source: where it came from, for the error.
+
+        Raises:
+            UserError: if it belongs to another run: another task, another belief, other sizes.
+        """
+        with fitting(source):
+            self.agent.load_state_dict(state["agent"])
+            self.algorithm.load_state_dict(state)
+            self.reward_statistics = ReturnStatistics(**state["reward_statistics"])
+            self.env.load_state_dict(state["transforms"])
+            if state["simulators"] is not None:
+                self.env.base_env.load_state_dict(state["simulators"])
+                set_carry_over(self.collector, state["carrier"])
+            progress = state["progress"]
+            self.frames, self.episodes = progress["frames"], progress["episodes"]
+            self.returns = deque(progress["returns"], maxlen=_RECENT_EPISODES)
+            self.seconds = progress["train_seconds"]
+            self.evaluated_frames = progress["evaluated_frames"]
+            torch.set_rng_state(state["torch_generator"])
+            if state["simulators"] is None:
+                # A seed of this point of the run: that of the run would repeat its first episodes.
+                self.env.base_env.set_seed(int(torch.randint(2**31, ())))
+                self.start_episodes()
+
+    def start_episodes(self) -> None:
+        """Begin new episodes in every environment."""
+        self.collector.reset()
+        discounted = torch.zeros_like(self.reward_statistics.discounted)
+        self.reward_statistics = self.reward_statistics._replace(discounted=discounted)
