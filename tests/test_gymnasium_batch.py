@@ -11,14 +11,16 @@ import copy
 import io
 import pickle
 import sys
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from contracts import parallel_env
 from env_tools import TASKS, play, random_actions
 from gymnasium import spaces
-from torchrl.envs import ParallelEnv, check_env_specs
+from torchrl.envs import check_env_specs
 
 from torchrl_drbpn import EnvPoolBatchEnv, GymnasiumBatchEnv, SimulatorError
 
@@ -339,7 +341,7 @@ def test_a_task_without_mujoco_says_that_it_can_not_be_saved():
 
 def test_a_task_that_can_not_be_saved_runs_in_parallel_environments():
     # TorchRL asks a shadow of each worker's environment for its state_dict.
-    env = ParallelEnv(2, lambda: GymnasiumBatchEnv("Pendulum-v1", 3, seed=0))
+    env = parallel_env(2, partial(GymnasiumBatchEnv, "Pendulum-v1", 3, seed=0))
     try:
         assert env.rollout(3)["observation"].shape == (2, 3, 3, 3)
     finally:
