@@ -1,8 +1,9 @@
 """PolicyStep: one decision on plain tensors.
 
 Specified here: over whole episodes, resets and missing entries included, its action and its state
-are those of the TensorDict policy acting with its mean, in every form of the filter; it is a frozen
-copy; torch.export takes it, with a batch of any size, and gives the same numbers.
+are those of the TensorDict policy acting with its mean, in every form of the filter, normalised or
+not; what is no number is missing and counted; the action fed back is the one that was chosen; it is
+a frozen copy; torch.export takes it, with a batch of any size, and gives the same numbers.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from torchrl_drbpn import (
     LinearGaussianEmission,
     PolicyStep,
 )
+from torchrl_drbpn.modules import MaskedObservationNorm
 
 ACTION, BATCH, TIME = 2, 3, 12
 
@@ -33,7 +35,7 @@ def perturbed(module: nn.Module) -> nn.Module:
     return module
 
 
-def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float64):
+def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float64, **keys):
     """A belief module of one kind, and a head of one hidden layer."""
     obs, state = {"information": (9, 4), "free": (3, 4)}.get(kind, (4, 4))
     transition, emission = None, None
@@ -46,6 +48,7 @@ def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float
     belief = BeliefFilterModule(
         BeliefFilter(obs, ACTION, state, transition=transition, emission=emission, dtype=dtype),
         policy_input=policy_input,
+        **keys,
     )
     head = nn.Sequential(
         nn.Linear(belief.feature_dim, 8, dtype=dtype),
@@ -77,12 +80,13 @@ def run_step(step: PolicyStep, obs: int):
         fresh = is_init[t]
         mean, age = torch.where(fresh, 0.0, mean), torch.where(fresh, 0, age)
         action = torch.where(fresh, 0.0, action)
-        action, mean, age = step(observation[t], observed[t], action, fresh, mean, age)
+        _, mean, age, action, rejected = step(observation[t], observed[t], action, fresh, mean, age)
+        assert not rejected.any()
         out.append(torch.cat([action, mean], -1))
     return torch.stack(out), age
 
 
-def run_module(belief: BeliefFilterModule, head: nn.Module):
+def run_module(belief: BeliefFilterModule, head: nn.Module, norm: nn.Module | None = None):
     """The same through keys."""
     observation, observed, is_init = inputs(belief.filter.obs_dim)
     mean = torch.zeros(BATCH, belief.filter.state_dim, dtype=torch.float64)
@@ -105,7 +109,7 @@ def run_module(belief: BeliefFilterModule, head: nn.Module):
             batch_size=[BATCH],
         )
         with torch.no_grad():
-            belief(data)
+            belief(data if norm is None else norm(data))
             action = head(data["features"])
         mean, age = data["next", "recurrent", "mean"], data["next", "recurrent", "age"]
         out.append(torch.cat([action, mean], -1))
@@ -117,8 +121,8 @@ def run_module(belief: BeliefFilterModule, head: nn.Module):
 def test_a_step_equals_the_tensordict_policy(kind, policy_input):
     belief, head = make(kind, policy_input)
     step = PolicyStep(belief, head)
-    forms = {"information": "information", "network": "loop"}
-    assert step.form == forms.get(kind, "innovation")
+    assert step.information is (kind == "information")
+    assert step.constant is (kind != "network")
     ours, our_age = run_step(step, belief.filter.obs_dim)
     expected, age = run_module(belief, head)
     torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-10)
@@ -148,7 +152,7 @@ def test_a_float32_step_has_the_digits_of_the_float32_module(obs, state, cov):
     action, mean = torch.zeros(rows, ACTION), torch.randn(rows, state, generator=g)
     first = torch.zeros(rows, 1, dtype=torch.bool)
     with torch.no_grad():
-        _, found, _ = step(reading, seen, action, first, mean, torch.ones(rows, 1).long())
+        found = step(reading, seen, action, first, mean, torch.ones(rows, 1).long())[1]
         expected = belief.step(mean, None, action, reading, seen, first.squeeze(-1)).mean
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
 
@@ -167,7 +171,7 @@ def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
         torch.randn(*batch, state, generator=g).double(),
     )
     first, age = torch.zeros(*batch, 1, dtype=torch.bool), torch.ones(*batch, 1).long()
-    chosen, filtered, _ = step(reading, seen, action, first, mean, age)
+    chosen, filtered = step(reading, seen, action, first, mean, age)[:2]
     assert chosen.shape == (*batch, ACTION)
     flat = [x.reshape(-1, x.shape[-1]) for x in (reading, seen, action, first, mean, age)]
     torch.testing.assert_close(filtered.reshape(-1, state), step(*flat)[1])
@@ -177,16 +181,36 @@ def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
     torch.testing.assert_close(cast.double(), filtered, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["innovation", "information"])
-def test_what_stands_under_a_false_mask_is_not_read(kind):
+def test_a_normalised_policy_is_one_step_with_its_statistics():
+    belief, head = make("innovation", in_key="normalized_observation")
+    norm = MaskedObservationNorm(4)
+    observation, observed, _ = inputs(4)
+    rollout = TensorDict(
+        {"observation": 3 * observation + 5, "observed": observed}, observation.shape[:2]
+    )
+    norm.update(rollout)
+    step = PolicyStep(belief, head, norm=norm)
+    expected, _ = run_module(belief, head, norm)
+    norm.update(rollout)  # a frozen copy: what is learned afterwards does not reach it
+    torch.testing.assert_close(run_step(step, 4)[0], expected, rtol=1e-9, atol=1e-10)
+    assert not torch.allclose(run_step(PolicyStep(belief, head), 4)[0], expected)
+
+
+@pytest.mark.parametrize("normed", [False, True])
+@pytest.mark.parametrize("junk", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("kind", ["innovation", "information", "network"])
+def test_what_is_no_number_is_missing_and_counted_where_it_was_called_observed(kind, junk, normed):
     belief, head = make(kind)
-    step = PolicyStep(belief, head)
-    observation, observed, is_init = (x[0] for x in inputs(belief.filter.obs_dim))
+    obs = belief.filter.obs_dim
+    step = PolicyStep(belief, head, norm=MaskedObservationNorm(obs) if normed else None)
+    observation, observed, is_init = (x[0] for x in inputs(obs))
     rest = (torch.zeros(BATCH, ACTION, dtype=torch.float64), is_init, *step.initial_state(BATCH))
-    clean = step(observation, observed, *rest)
-    spoilt = step(torch.where(observed, observation, torch.nan), observed, *rest)
-    for a, b in zip(clean, spoilt, strict=True):
+    *clean, none = step(observation, observed, *rest)
+    assert not none.any()
+    spoilt = step(torch.where(observed, observation, junk), torch.ones_like(observed), *rest)
+    for a, b in zip(clean, spoilt, strict=False):
         assert torch.equal(a, b)
+    assert torch.equal(spoilt[-1], (~observed).sum(-1, keepdim=True))
 
 
 def test_later_training_does_not_reach_the_copy():
@@ -200,7 +224,7 @@ def test_later_training_does_not_reach_the_copy():
     assert not any(p.requires_grad for p in step.parameters())
 
 
-def test_a_head_may_return_location_and_scale_and_limits_clip():
+def test_limits_clip_the_action_and_leave_what_is_fed_back():
     belief, head = make("innovation")
 
     class LocScale(nn.Module):
@@ -217,16 +241,37 @@ def test_a_head_may_return_location_and_scale_and_limits_clip():
     observation, observed, is_init = (x[0] for x in inputs(4))
     rest = (torch.zeros(BATCH, ACTION, dtype=torch.float64), is_init, *plain.initial_state(BATCH))
     action = plain(observation, observed, *rest)[0]
+    clipped, _, _, chosen, _ = limited(observation, observed, *rest)
     assert action.abs().max() > 0.05
-    clipped = limited(observation, observed, *rest)[0]
     assert torch.equal(clipped, action.clamp(-0.05, 0.05))
+    assert torch.equal(chosen, action)
+    # the belief of an episode is that of the policy that was trained, which knows no limits
+    torch.testing.assert_close(run_step(limited, 4)[0], run_module(belief, head)[0])
+
+
+@pytest.mark.parametrize(("place", "width"), [(0, 1), (1, 1), (2, 1), (3, ACTION), (4, 1), (5, 2)])
+def test_a_tensor_of_another_width_is_refused_and_not_broadcast(place, width):
+    belief, head = make("innovation")
+    step = PolicyStep(belief, head)
+    observation, observed, is_init = (x[0] for x in inputs(4))
+    action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
+    args = [observation, observed, action, is_init, *step.initial_state(BATCH)]
+    args[place] = args[place][:, :1].expand(BATCH, width)
+    with pytest.raises(ValueError, match=r"must be .* of shape \(\*batch, \d\)"):
+        step(*args)
+    args[place] = args[place][:1]
+    with pytest.raises(ValueError, match=r"must be .* of shape \(\*batch, \d\)"):
+        step(*args)
 
 
 @pytest.mark.parametrize("kind", ["innovation", "information", "network"])
 def test_export_takes_it_with_any_batch(kind):
     belief, head = make(kind)
-    step = PolicyStep(belief, head)
+    limit = torch.full((ACTION,), 0.05, dtype=torch.float64)
+    norm = MaskedObservationNorm(belief.filter.obs_dim)
+    step = PolicyStep(belief, head, norm=norm, action_low=-limit, action_high=limit)
     observation, observed, is_init = (x[0] for x in inputs(belief.filter.obs_dim))
+    observation[0, 0] = torch.nan
     action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
     args = (observation, observed, action, is_init, *step.initial_state(BATCH))
     batch = torch.export.Dim("batch", min=1, max=1024)

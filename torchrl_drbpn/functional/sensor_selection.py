@@ -196,7 +196,7 @@ def _as_matrices(H: Tensor, P: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tenso
                 "any variance has no log-determinant. Add a small variance to its diagonal."
             )
     try:
-        batch = torch.broadcast_shapes(H.shape[:-2], P.shape[:-2], R.shape[:-2])
+        batch = (H[..., 0, 0] + P[..., 0, 0] + R[..., 0, 0]).shape
     except RuntimeError as error:
         raise ValueError(
             "`emission_matrix`, `predicted_cov` and `emission_cov` must have batch shapes that "

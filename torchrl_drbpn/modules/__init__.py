@@ -2,10 +2,10 @@
 
 from torchrl_drbpn.modules.belief_filter import BeliefDivergedError, BeliefFilter
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
-from torchrl_drbpn.modules.export import PolicyStep
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
 from torchrl_drbpn.modules.particle_filter import ParticleFilterModule
 from torchrl_drbpn.modules.particle_model import ParticleFilter
+from torchrl_drbpn.modules.policy_step import PolicyStep
 from torchrl_drbpn.modules.state_space import GaussianTransition, LinearGaussianEmission
 
 __all__ = [
