@@ -25,11 +25,13 @@ from agents import (
 )
 from contracts import LossContract
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss
+from torchrl_drbpn.modules import MaskedObservationNorm
 
 PPO_TERMS = ("loss_objective", "loss_critic", "loss_entropy")
 
@@ -502,6 +504,22 @@ def test_what_a_head_reads_beside_the_features_is_among_the_in_keys():
     out = loss(data.select(*loss.in_keys, strict=False))
     out["loss_critic"].backward()
     assert value.weight.grad.abs().min() > 0
+
+
+def test_a_norm_in_front_of_the_filter_scales_the_next_observation_too():
+    data, norm = make_data(), MaskedObservationNorm(OBS)
+    norm.update(data)
+    belief = BeliefFilterModule(
+        make_filter(OBS, ACTION, torch.float64), in_keys={"observation": "normalized_observation"}
+    )
+    agent = make_agent(belief, belief.feature_dim)
+    outs = []
+    for module in (TensorDictSequential(norm, belief), belief):
+        outs.append(DRBPNLoss(module, make_ppo(agent), BeliefModelLoss())(data))
+        norm(data)
+        norm(data["next"])
+    for key, value in outs[1].items():
+        torch.testing.assert_close(outs[0][key], value, msg=key)
 
 
 class Joined(nn.Linear):

@@ -1,15 +1,16 @@
-"""The transforms know nothing of the filter: TorchRL's SAC learns from corrupted sensors.
+"""Transforms and normalisation know nothing of the filter: TorchRL's SAC learns with them.
 
 A short real run on InvertedPendulum-v5: collector, replay buffer, SACLoss, SoftUpdate. What the
-buffer holds is what the sensors gave: a missing entry is 0 after normalisation, or the last value
-that arrived where it is filled, at the root of a transition as in its next step.
+buffer holds is what the sensors gave, in raw units: a missing entry is 0, or the last value that
+arrived where it is filled, at the root of a transition as in its next step. The normalisation is
+first in the policy, learns from each collected batch once, and is applied to what is sampled.
 """
 
 from __future__ import annotations
 
 import pytest
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -20,11 +21,11 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl_drbpn import (
     FillLastObserved,
     GymnasiumBatchEnv,
-    MaskedObservationNorm,
     ObservationMissingness,
     ObservationNoise,
     seed_env,
 )
+from torchrl_drbpn.modules import MaskedObservationNorm
 
 ENVS, OBS, ACTION, FRAMES, BATCHES = 4, 4, 1, 64, 4
 NOISE = 0.01
@@ -65,20 +66,21 @@ def make_networks() -> tuple[ProbabilisticActor, ValueOperator]:
             return self.net(torch.cat([observation, observed.to(observation.dtype), action], -1))
 
     actor = ProbabilisticActor(
-        TensorDictModule(Head(), ["observation", "observed"], ["loc", "scale"]),
+        TensorDictModule(Head(), ["normalized_observation", "observed"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": -3.0, "high": 3.0},
         return_log_prob=False,
     )
-    return actor, ValueOperator(Value(), in_keys=["observation", "observed", "action"])
+    return actor, ValueOperator(Value(), in_keys=["normalized_observation", "observed", "action"])
 
 
-@pytest.mark.parametrize("treatment", ["normalised", "filled"])
-def test_sac_learns_from_what_the_sensors_gave(treatment):
+@pytest.mark.parametrize("missing", ["zero", "keep"])
+def test_sac_learns_from_what_the_sensors_gave(missing):
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        last = {"normalised": MaskedObservationNorm, "filled": FillLastObserved}[treatment]()
+        filling = [FillLastObserved(fill_value=float("nan"))] if missing == "keep" else []
+        norm = MaskedObservationNorm(OBS, missing=missing)
         actor, qvalue = make_networks()
         loss = SACLoss(actor, qvalue, num_qvalue_nets=2, target_entropy=-float(ACTION))
         loss.make_value_estimator(gamma=0.99)
@@ -87,8 +89,8 @@ def test_sac_learns_from_what_the_sensors_gave(treatment):
         buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), batch_size=32)
         before = [parameter.detach().clone() for parameter in actor.parameters()]
         collector = Collector(
-            make_env([last]),
-            actor,
+            make_env(filling),
+            TensorDictSequential(norm, actor),
             frames_per_batch=FRAMES,
             total_frames=BATCHES * FRAMES,
             auto_register_policy_transforms=False,
@@ -97,10 +99,13 @@ def test_sac_learns_from_what_the_sensors_gave(treatment):
         try:
             for data in collector:
                 rollouts.append(data.clone())
+                norm.update(data)
                 buffer.extend(data.reshape(-1))
                 for _ in range(4):
                     sample = buffer.sample()
-                    check_masks(sample, treatment)
+                    norm(sample)
+                    norm(sample["next"])
+                    check_normalised(sample, norm)
                     out = loss(sample)
                     total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
                     optimizer.zero_grad()
@@ -118,28 +123,28 @@ def test_sac_learns_from_what_the_sensors_gave(treatment):
     assert data["next", "done"].any()
     missing = 1 - data["observed"].float().mean((0, 1))
     assert (missing - 0.3).abs().max() < 0.1
-    if treatment == "filled":
+    if missing == "keep":
         check_filled(data)
 
 
-def check_masks(sample, treatment: str) -> None:
+def check_normalised(sample, norm: MaskedObservationNorm) -> None:
     for part in (sample, sample["next"]):
-        assert part["observed"].dtype == torch.bool
-        assert part["observed"].shape == part["observation"].shape
-        assert part["observation"].isfinite().all()
-        if treatment == "normalised":
-            # zero where nothing arrived, and nowhere else: noise keeps arrived entries off zero
-            assert torch.equal(part["observation"] == 0, ~part["observed"])
-        else:
-            arrived = part["observed"]
-            error = part["observation"][arrived] - part["complete_observation"][arrived]
-            assert error.abs().max() < 6 * NOISE
-            assert (error != 0).all()
+        raw, observed, scaled = (
+            part[key] for key in ("observation", "observed", "normalized_observation")
+        )
+        assert scaled.isfinite().all()
+        expected = (raw - norm.mean) / norm.std
+        torch.testing.assert_close(scaled[observed].double(), expected[observed])
+        unknown = ~observed if norm.missing == "zero" else raw.isnan()
+        assert torch.equal(scaled == 0, unknown)
+        error = raw[observed] - part["complete_observation"][observed]
+        assert error.abs().max() < 6 * NOISE
+        assert (error != 0).all()
 
 
 def check_filled(data) -> None:
-    """Along each row a missing entry repeats the one before, or is 0 at an episode's start."""
+    """Along each row a missing entry repeats the one before; none is known at a start."""
     for t in range(data.shape[1]):
         before, after = data[:, t], data[:, t]["next"]
         expected = torch.where(after["observed"], after["observation"], before["observation"])
-        assert torch.equal(after["observation"], expected)
+        torch.testing.assert_close(after["observation"], expected, rtol=0, atol=0, equal_nan=True)

@@ -375,7 +375,10 @@ class BeliefFilter(nn.Module):
         if not self.validate or torch.compiler.is_compiling() or out.mean.is_meta:
             return
         total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
-        if bool(torch.isfinite(total)):
+        try:
+            if bool(torch.isfinite(total)):
+                return
+        except RuntimeError:  # under vmap no number reaches the host
             return
         bad = observed & ~torch.isfinite(observation)
         if bool(bad.any()):

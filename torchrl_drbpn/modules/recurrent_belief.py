@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -194,7 +195,14 @@ class RecurrentBeliefModule(TensorDictModuleBase):
     @property
     def dtype(self) -> torch.dtype:
         """Precision of the filter's parameters."""
-        return next(self.filter.parameters()).dtype
+        # Value estimators swap detached tensors in, which are attributes and no parameters.
+        swapped = (
+            value
+            for module in self.filter.modules()
+            for value in vars(module).values()
+            if isinstance(value, Tensor)
+        )
+        return next(itertools.chain(self.filter.parameters(), swapped)).dtype
 
     @property
     def recurrent_mode(self) -> bool:

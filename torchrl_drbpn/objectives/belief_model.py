@@ -86,11 +86,6 @@ class BeliefModelLoss(LossModule):
         nexts = (keys.log_likelihood, keys.observed, keys.done, keys.terminated)
         return [keys.log_likelihood, keys.observed, *map(in_next, nexts), keys.final, "index"]
 
-    @in_keys.setter
-    def in_keys(self, value: list[NestedKey]) -> None:
-        del value
-        raise RuntimeError("the in_keys follow from the keys: use set_keys to rename one.")
-
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Do nothing: this loss estimates no value."""
 

@@ -199,21 +199,11 @@ class DRBPNLoss(LossModule):
         read = [key for key in map(unravel_key, read) if key not in written]
         return list(dict.fromkeys([*read, *map(unravel_key, own)]))
 
-    @in_keys.setter
-    def in_keys(self, value: list[NestedKey]) -> None:
-        del value
-        raise RuntimeError("the in_keys follow from the held modules: use set_keys to rename one.")
-
     @property
     def out_keys(self) -> list[NestedKey]:
         """Entries written: the PPO loss's and the model loss's."""
         model = [] if self.model_loss is None else self.model_loss.out_keys
         return [*self.ppo_loss.out_keys, *model]
-
-    @out_keys.setter
-    def out_keys(self, value: list[NestedKey]) -> None:
-        del value
-        raise RuntimeError("the out_keys follow from the held losses.")
 
     # -------------------------------------------------------------- networks
     @property
