@@ -192,7 +192,6 @@ def test_notation_names_the_keys_that_are_read_and_written():
         "ObservationSpikes": (0.1, 5.0),
         "SensorOutages": (0.5, 5),
         "SensorReduction": ([0],),
-        "RunningReturnScale": (0.99,),
     }
     room = importlib.import_module("torchrl_drbpn.transforms")
     for name in room.__all__:

@@ -17,8 +17,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 
-from torchrl_drbpn import GymnasiumBatchEnv, ObservationMissingness
-from torchrl_drbpn.modules import MaskedObservationNorm
+from torchrl_drbpn import GymnasiumBatchEnv, MaskedObservationNorm, ObservationMissingness
 
 OBS = 3
 DOUBLE = torch.float64

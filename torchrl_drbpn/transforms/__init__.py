@@ -7,21 +7,17 @@ from torchrl_drbpn.transforms.missingness import (
     SensorReduction,
 )
 from torchrl_drbpn.transforms.noise import ObservationNoise, ObservationSpikes
-from torchrl_drbpn.transforms.normalisation import MaskedObservationNorm
 from torchrl_drbpn.transforms.outages import SensorOutages
 from torchrl_drbpn.transforms.previous_action import PreviousAction
-from torchrl_drbpn.transforms.return_scale import RunningReturnScale
 from torchrl_drbpn.transforms.seeding import seed_env
 
 __all__ = [
     "FillLastObserved",
-    "MaskedObservationNorm",
     "ObservationMissingness",
     "ObservationNoise",
     "ObservationSpikes",
     "ObservedFromNaN",
     "PreviousAction",
-    "RunningReturnScale",
     "SensorOutages",
     "SensorReduction",
     "seed_env",
