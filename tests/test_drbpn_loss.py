@@ -30,8 +30,7 @@ from torch import nn
 from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss
-from torchrl_drbpn.modules import MaskedObservationNorm
+from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss, MaskedObservationNorm
 
 PPO_TERMS = ("loss_objective", "loss_critic", "loss_entropy")
 
