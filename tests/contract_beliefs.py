@@ -479,14 +479,24 @@ class BeliefModuleContract(BeliefFrames):
             self.make_module()(self.make_frames(()))
 
     @pytest.mark.parametrize("over_time", [False, True])
-    @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
-    def test_what_is_no_number_under_a_true_mask_is_refused(self, over_time, wrong):
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            (torch.nan, r"NaN .*components \[3\].*ObservedFromNaN"),
+            (torch.inf, r"infinite readings .*components \[3\].*`observed` to False"),
+            (
+                1e25,
+                r"readings over .*squares overflow .*components \[3\].*MaskedObservationNorm",
+            ),
+        ],
+    )
+    def test_a_reading_that_cannot_be_counted_is_called_what_it_is(self, over_time, wrong, message):
         module = self.make_module()
         data = self.one_by_one(module, self.make_frames((3, 4)), self.some_state(module, (3,)))
         data["observed"][1, 2, 3], data["observation"][1, 2, 3] = True, wrong
         with (
             set_recurrent_mode(over_time),
-            pytest.raises(ValueError, match=r"`observation` holds .*components \[3\]"),
+            pytest.raises(ValueError, match=f"`observation` holds {message}"),
         ):
             module(data.select(*module.in_keys))
 

@@ -100,7 +100,7 @@ def test_a_trajectory_ends_with_the_state_of_its_own_readings(module):
             torch.testing.assert_close(both[key][:, 4], alone[1][key][:, -1])
 
 
-@pytest.mark.parametrize("over_time", [False])
+@pytest.mark.parametrize("over_time", [False, True])
 def test_vmap_over_stacked_parameters_is_a_loop(over_time):
     # PyTorch's fused GRU, in GRUModule and over particles, has no batching rule
     embed = TensorDictModule(nn.Linear(OBS, OBS), ["raw"], ["value"])

@@ -380,14 +380,7 @@ class BeliefFilter(nn.Module):
                 return
         except RuntimeError:  # under vmap no number reaches the host
             return
-        bad = observed & ~torch.isfinite(observation)
-        if bool(bad.any()):
-            components = bad.flatten(0, -2).any(0).nonzero().flatten().tolist()
-            raise ValueError(
-                "`observation` holds NaN or inf in entries that `observed` calls arrived "
-                f"(components {components}): mark them missing, for example with "
-                "ObservedFromNaN."
-            )
+        refuse_readings(observation, observed)
         for name, value in (("previous_action", previous_action), ("mean", mean)):
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(
@@ -398,6 +391,39 @@ class BeliefFilter(nn.Module):
             "the belief is no longer finite although every observed entry is: the learned model "
             "diverged. Lower the learning rate, or use residual=False where state > obs."
         )
+
+
+def refuse_readings(observation: Tensor, observed: Tensor) -> None:
+    """Raise if readings that arrived are no numbers that a filter can compute with.
+
+    Args:
+        observation: shape ``(*batch, obs)``.
+        observed: bool, the same shape.
+
+    Raises:
+        ValueError: for NaN, infinite or too large readings; says which components.
+    """
+    largest = torch.finfo(observation.dtype).max ** 0.5
+    for bad, what, remedy in (
+        (observation.isnan(), "NaN", "mark them missing, for example with ObservedFromNaN"),
+        (
+            observation.isinf(),
+            "infinite readings",
+            "a sensor or a division has overflowed; set `observed` to False there "
+            "(ObservedFromNaN marks NaN alone)",
+        ),
+        (
+            observation.abs() > largest,
+            f"readings over {largest:.1e}, whose squares overflow",
+            "standardise them with MaskedObservationNorm, which clips, or mark them missing",
+        ),
+    ):
+        at = (bad & observed).reshape(-1, observation.shape[-1]).any(0).nonzero().flatten().tolist()
+        if at:
+            raise ValueError(
+                f"`observation` holds {what} in entries that `observed` calls arrived "
+                f"(components {at}): {remedy}."
+            )
 
 
 def _describe(value: Tensor) -> str:

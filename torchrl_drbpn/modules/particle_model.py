@@ -20,7 +20,7 @@ from torchrl_drbpn.functional import (
     zero_missing,
 )
 from torchrl_drbpn.functional.gaussian import check_observed
-from torchrl_drbpn.modules.belief_filter import BeliefDivergedError
+from torchrl_drbpn.modules.belief_filter import BeliefDivergedError, refuse_readings
 
 __all__ = ["ParticleFilter"]
 
@@ -329,14 +329,7 @@ class ParticleFilter(nn.Module):
             return
         if bool(torch.isfinite(log_likelihood).all()):
             return
-        bad = observed & ~torch.isfinite(observation)
-        if bool(bad.any()):
-            components = bad.flatten(0, -2).any(0).nonzero().flatten().tolist()
-            raise ValueError(
-                "`observation` holds NaN or inf in entries that `observed` calls arrived "
-                f"(components {components}): mark them missing, for example with "
-                "ObservedFromNaN."
-            )
+        refuse_readings(observation, observed)
         raise BeliefDivergedError(
             "the particles are no longer finite although every observed entry is: the learned "
             "model diverged. Lower the learning rate."

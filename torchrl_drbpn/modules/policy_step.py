@@ -21,9 +21,9 @@ class PolicyStep(nn.Module):
     .. math::
         m_t = m^-_t + K_t (x_t - H m^-_t - B a_{t-1} - d), \qquad a_t = \mu(m_t)
 
-    The numbers of the policy's modules one step at a time, with the mean action (eq. 8, 10, 11
-    [DRBPN]), as a frozen copy: later training does not reach it. What the parameters alone
-    determine is computed once, here, and kept in buffers. It has no TensorDict and no branch on
+    The numbers of the policy's modules one step at a time, with the mean action, as a frozen copy:
+    later training does not reach it. What the parameters alone determine is computed once, here,
+    and kept in buffers. It has no TensorDict and no branch on
     values, so ``torch.export.export`` takes it, with a dynamic batch too, and
     ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time.
 
