@@ -11,7 +11,6 @@ from torchrl.data import (
     Bounded,
     Categorical,
     Composite,
-    TensorDictReplayBuffer,
     Unbounded,
 )
 from torchrl.envs import (
@@ -91,11 +90,6 @@ def parallel_env(workers: int, factory: Any) -> ParallelEnv:
 def with_transform(make_env: Any, make_transform: Any) -> EnvBase:
     """Return `make_env()` with `make_transform()` appended."""
     return make_env().append_transform(make_transform())
-
-
-def extend_and_sample(buffer: TensorDictReplayBuffer, data: TensorDictBase) -> None:
-    buffer.extend(data)
-    buffer.sample()
 
 
 def saved(state: Any) -> Any:

@@ -1,13 +1,9 @@
-"""Duties that every transform, loss and belief module of the package must meet.
+"""Duties that every loss and belief module of the package must meet.
+
+Those of transforms are in `test_transforms_requirements.py`.
 
 A test file subclasses a contract, fills in its hooks and inherits its tests. The classes here are
 not collected by themselves: their names do not begin with "Test".
-
-`TransformContract` is TorchRL's own list for a transform test (single, serial-trans,
-parallel-trans, trans-serial, trans-parallel, no env, compose, env, model, replay buffer, inverse),
-and on top: any leading batch shape, float64 kept, the first observation of an episode treated like
-every other, partial resets that leave the other rows alone, the global generator untouched, a
-state that survives `torch.save` with `weights_only=True`, copies without a parent.
 
 `LossContract` is TorchRL's list for a loss: keys, dispatch, reduction, parameters held once, files,
 copies, dtypes and devices.
@@ -39,7 +35,6 @@ from contract_environments import (
 )
 from contract_losses import LossContract
 from contract_recipe_beliefs import RecipeBeliefContract
-from contract_transforms import TransformContract
 
 __all__ = [
     "ACTION",
@@ -48,7 +43,6 @@ __all__ = [
     "LossContract",
     "RecipeBeliefContract",
     "StaircaseEnv",
-    "TransformContract",
     "actions_in_float64",
     "belief_env",
     "gym_env",
