@@ -382,6 +382,16 @@ def test_an_evaluation_draws_methods_noise_and_runs_of_one_seed_apart() -> None:
     assert (summary.low.iloc[0], summary.high.iloc[0]) == (1.0, 3.0)
 
 
+def test_a_run_without_evaluation_or_finished_episode_is_reported(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "a", "evaluation.final_episodes=0", points={})
+    for name in ("evaluation.csv", "robustness.csv"):
+        (folder / name).unlink()
+    assert "## Evaluation" not in report([folder], tmp_path / "out")
+    curve = pd.read_csv(folder / "metrics.csv").assign(**{"return": None})
+    write_table(folder / "metrics.csv", curve)
+    assert "## Training" in report([folder], tmp_path / "out")
+
+
 # What a user gets wrong -------------------------------------------------------------------------
 
 

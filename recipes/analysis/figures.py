@@ -32,7 +32,7 @@ _LEVELS = {
 _TITLES = {"mcar": "MCAR", "mar": "MAR", "nmar": "NMAR"}
 
 
-def learning_curves(training: pd.DataFrame) -> Figure:
+def learning_curves(training: pd.DataFrame) -> Figure | None:
     """Draw training return over environment steps, one panel a task.
 
     Args:
@@ -40,10 +40,12 @@ def learning_curves(training: pd.DataFrame) -> Figure:
 
     Returns:
         The figure: interquartile mean over seeds and its 95 % interval; on complete, exact
-        observations also the paper's threshold.
+        observations also the paper's threshold. None where no episode has ended.
     """
     training = training.assign(label=_labels(training)).dropna(subset="return")
     panels = list(training.groupby("task"))
+    if not panels:
+        return None
     with mpl.rc_context(STYLE):
         figure, axes = _panels(-(-len(panels) // _COLUMNS), min(len(panels), _COLUMNS))
         colours = _colours(training.label)

@@ -167,7 +167,7 @@ def _comparison(table: pd.DataFrame) -> str:
         + ("" if row.low != row.low else f" [{row.low:+.0%}, {row.high:+.0%}]")
         for row in table.itertuples()
     ]  # fmt: skip
-    shown = table[["task", "trained_on", "point", "over"]].assign(
+    shown = table[["task", "trained_on", "point", "method", "over"]].assign(
         steps=[
             "" if s != s else f"{s:,.0f}" if s == o else f"{s:,.0f} and {o:,.0f}"
             for s, o in zip(table.steps, table.steps_over, strict=True)

@@ -62,7 +62,8 @@ def summarise(study: Study) -> pd.DataFrame:
         Rows for each group, point (``training``: the last 100 training episodes) and kind of
         action: interquartile mean and ends of its 95 % interval, the share of the return with
         nothing missing (a ratio of interquartile means), means of the other columns, and every
-        seed's own return. A group in which a seed has no number at a point has no row there.
+        seed's own return. A group in which a seed has no number has no row at a point, and no
+        mean of its training.
     """
     training = study.runs.rename(columns={"return": "return_mean"})
     rows = pd.concat([training.assign(point=TRAINING, mode="sampled"), last_evaluations(study)])
@@ -70,14 +71,17 @@ def summarise(study: Study) -> pd.DataFrame:
     out = []
     for key, members in rows.groupby([*GROUP, "point", "mode"], sort=False):
         values = members.return_mean.to_numpy(float)
-        if len(values) < seeds[key[: len(GROUP)]] or np.isnan(values).any():
+        known = len(values) == seeds[key[: len(GROUP)]] and not np.isnan(values).any()
+        if not known and TRAINING not in key:
             continue
-        low, high = interval(values)
+        mean, ends = np.nan, (np.nan, np.nan)
+        if known:
+            mean, ends = interquartile_mean(values), interval(values)
         own = " ".join(f"{s}={v:.6g}" for s, v in zip(members.seed, values, strict=True))
         means = ("missing_ratio", "log_likelihood", "diverged", "steps_per_second")
         out.append(
             dict(zip([*GROUP, "point", "mode"], key, strict=True))
-            | {"seeds": len(values), "return": interquartile_mean(values), "low": low, "high": high}
+            | {"seeds": len(values), "return": mean, "low": ends[0], "high": ends[1]}
             | {name: members[name].astype(float).mean() for name in means if name in members}
             | {"per_seed": own}
         )
@@ -167,16 +171,16 @@ def compare(study: Study, summary: pd.DataFrame, reference: str) -> pd.DataFrame
         where = dict(zip(_WHERE, key, strict=True))
         for other in sorted(set(members.method) - {reference}):
             both = members[members.method.isin([reference, other])]
-            pairs = []
+            named, pairs = {"method": reference, "over": other}, []
             for task, here in both.groupby("task"):
                 values = [here[here.method == name].return_mean for name in (reference, other)]
                 if min(map(len, values)):
                     pairs.append([value.to_numpy(float) for value in values])
                     steps = [here[here.method == n].frames.min() for n in (reference, other)]
-                    at = {"task": task, "over": other, "steps": steps[0], "steps_over": steps[1]}
-                    out.append(at | where | _comparison(pairs[-1:]))
+                    at = {"task": task, "steps": steps[0], "steps_over": steps[1]}
+                    out.append(named | at | where | _comparison(pairs[-1:]))
             if len(pairs) > 1:
-                out.append({"task": ALL_TASKS, "over": other} | where | _comparison(pairs))
+                out.append(named | {"task": ALL_TASKS} | where | _comparison(pairs))
     table = pd.DataFrame(out)
     if len(table):
         paper = family(table.task).map(MARGINS_OVER_DVRL)
