@@ -52,7 +52,7 @@ def run(config: dict[str, Any]) -> int:
         raise UserError(f"`rows` must be a whole number of at least 2, got {config['rows']!r}.")
     study = read_runs(
         find_folders(config["run"]),
-        config["evaluation"],
+        config["table"],
         rows=config["rows"],
         unfinished=config["unfinished"],
     )

@@ -31,7 +31,7 @@ from training.methods import method_name, training_labels
 from training.run_folder import read_config, write_config
 
 ASKED = {"run": None, "out": None, "from": None, "title": None}
-ASKED |= {"evaluation": None, "reference": "drbpn", "rows": 100, "unfinished": False}
+ASKED |= {"table": None, "reference": "drbpn", "rows": 100, "unfinished": False}
 FRAMES = [100, 200, 300, 400]
 STUDIES = sorted(path.parent for path in (ROOT / "results").glob("*/runs.csv"))
 WRITTEN = ("summary.csv", "aggregate.csv", "comparison.csv", "README.md")
@@ -411,7 +411,7 @@ def test_runs_that_are_not_finished_are_refused_unless_asked_for(tmp_path: Path)
     [
         ({"run": "nowhere/*"}, r"`run` must name run folders, nowhere/\* matches none"),
         ({"run": "nowhere"}, "`run` must name run folders, there is no folder nowhere"),
-        ({"run": None}, "`run` must name run folders: 'run="),
+        ({"run": None}, "`run` must name run folders: run="),
         ({"run": [], "out": None}, "`out` must be the folder of a study"),
         ({"from": "nowhere"}, "`from` reads and writes the tables of a study: leave out `run`"),
         ({"from": "nowhere", "run": None, "out": None}, "`from` must name folders with a runs.csv"),
