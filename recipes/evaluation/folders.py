@@ -54,7 +54,11 @@ def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
     Returns:
         Those with a checkpoint; all, where none has one: reading the first says what is wrong.
     """
-    found = [folder for folder in folders if checkpoint_frames(folder) is not None]
+    found = [
+        folder
+        for folder in folders
+        if checkpoint_frames(folder) is not None or any(folder.glob("*.safetensors"))
+    ]
     for folder in folders if found else ():
         if folder not in found:
             say(f"{folder.name}: left out, it has no checkpoint yet")

@@ -8,10 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from omegaconf import DictConfig
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from training.agent import Agent, load_agent
+from training.agent import Agent, load_agent, make_agent
+from training.checkpoint import fitting
 from training.envs import make_env
 from training.errors import UserError
 from training.methods import method_name
@@ -20,6 +23,8 @@ from training.sensors import sensor_names
 
 from evaluation.episodes import BLOCK, make_evaluation_environment
 from torchrl_drbpn import BeliefFilterModule
+
+WEIGHTS = "agent.safetensors"  # of an agent that was saved by itself
 
 
 @dataclass(frozen=True)
@@ -93,10 +98,10 @@ class TrainedAgent:
 
 
 def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
-    """Read the last checkpoint of a run.
+    """Read the last checkpoint of a run, or an agent that was saved by itself.
 
     Args:
-        folder: the run folder.
+        folder: the run folder, or one of ``recipes/save_agent.py``.
         gate: standard deviations of the innovation, beyond which a reading counts as if at that
             distance; None: every reading is believed. The agent's method names it.
 
@@ -106,11 +111,41 @@ def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
     Raises:
         UserError: if the folder or the checkpoint can't be used, or the gate is refused.
     """
-    config = load_config(folder)
+    config, weights = load_config(folder), folder / WEIGHTS
     with closing(make_env(config, num_envs=1)) as env:
-        agent, frames = load_agent(folder, config, env)
+        if weights.is_file():
+            agent = make_agent(config, env)
+            frames = _load_weights(weights, agent)
+        else:
+            agent, frames = load_agent(folder, config, env)
     trained = TrainedAgent(config, agent, frames, method_name(config))
     return trained if gate is None else _gated(trained, gate)
+
+
+def save_weights(folder: Path, trained: TrainedAgent) -> None:
+    """Write the weights of an agent whole, the statistics of its normalisation among them.
+
+    Args:
+        folder: an existing folder.
+        trained: the agent.
+    """
+    tensors = {name: value.contiguous() for name, value in trained.agent.state_dict().items()}
+    temporary = folder / f".{WEIGHTS}.tmp"
+    save_file(tensors, temporary, metadata={"frames": str(trained.frames)})
+    temporary.replace(folder / WEIGHTS)
+
+
+def _load_weights(path: Path, agent: Agent) -> int:
+    """Give an agent its weights; return the environment steps that it was trained for."""
+    try:
+        with safe_open(path, "pt") as file:
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            frames = int(file.metadata()["frames"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"`{path}` can't be read as weights: is it damaged?") from error
+    with fitting(str(path)):
+        agent.load_state_dict(weights)
+    return frames
 
 
 def _gated(trained: TrainedAgent, gate: float) -> TrainedAgent:

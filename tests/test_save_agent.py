@@ -1,0 +1,69 @@
+"""An agent saved by itself: it acts as the run did, and its card says how it was trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("hydra")
+pytest.importorskip("safetensors")
+from evaluation_tools import evaluate, trained_folder  # isort: skip
+
+import play
+import save_agent
+import torch
+from evaluation.trained import WEIGHTS, load_trained_agent
+from evaluation_tools import configured
+from training.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return trained_folder(folder, "evaluation.final_episodes=2")
+
+
+def save(run: Any, out: Any) -> int:
+    return save_agent.run({"run": run and str(run), "out": out and str(out)})
+
+
+def test_a_saved_agent_acts_as_the_run_did(finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "agents" / "pendulum"
+    assert save(finished, out) == 0
+    left = {path.name for path in out.iterdir()}
+    assert left == {"README.md", WEIGHTS, "config.yaml", "evaluation.csv", "versions.json"}
+    first, second = load_trained_agent(finished), load_trained_agent(out)
+    assert first.frames == second.frames
+    for name, value in first.agent.state_dict().items():  # the normalisation's among them
+        assert torch.equal(second.agent.state_dict()[name], value), name
+    tables = [
+        evaluate(tmp_path / f"{i}.csv", folder, points="'mcar:0.5'")
+        for i, folder in enumerate((finished, out))
+    ]
+    assert tables[0] == [row | {"run": finished.name} for row in tables[1]]
+    film = configured("play") | {"run": str(out), "robot": False, "start": 0, "steps": 2}
+    assert play.run(film) == 0
+    card = (out / "README.md").read_text()
+    for told in ("# InvertedPendulum-v5, drbpn", "mcar:0.2", "| 128 |", "| seed | 0 |", "sampled"):
+        assert told in card
+
+
+def test_what_is_no_finished_run_or_no_weights_is_one_line(finished: Path, tmp_path: Path) -> None:
+    young = trained_folder(tmp_path / "young")
+    for run, out, message in (
+        (None, tmp_path / "x", "`run` must name a folder"),
+        (finished, None, "`out` must name a folder"),
+        (finished, young, "`out` must be a folder for an agent"),
+        (young, tmp_path / "x", "has no final evaluation yet"),
+    ):
+        with pytest.raises(UserError, match=message):
+            save(run, out)
+    assert not (tmp_path / "x").exists()
+    save(finished, tmp_path / "agent")
+    weights = tmp_path / "agent" / WEIGHTS
+    weights.write_bytes(weights.read_bytes()[:-40])
+    with pytest.raises(UserError, match="can't be read as weights") as caught:
+        load_trained_agent(tmp_path / "agent")
+    assert "\n" not in str(caught.value)
