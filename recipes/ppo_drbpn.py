@@ -15,6 +15,7 @@ from typing import Any
 
 import hydra
 import torch
+from evaluation.folders import override
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -168,7 +169,8 @@ def train(config: DictConfig, folder: Path) -> int:
         if config.resume is None:
             if (folder / "config.yaml").exists():
                 raise UserError(
-                    f"`{folder}` holds a run already: name another folder, or resume={folder}."
+                    f"`{folder}` holds a run already: name another folder, or "
+                    f"{override('resume', folder)}."
                 )
         else:
             path = last_checkpoint(folder)
@@ -248,7 +250,7 @@ def _loop(
         speed = (training.frames - first) / (training.seconds - first_seconds)
         say(f"{speed:.0f} steps/s in collection and update, start-up and evaluation excluded")
     if stop:
-        say(f"stopped and saved; continue with resume={folder}")
+        say(f"stopped and saved; continue with {override('resume', folder)}")
     elif episodes := config.evaluation.final_episodes:
         rows = evaluate_training(config, training, "final", episodes, lambda: bool(stop))
         if rows is not None:

@@ -79,4 +79,6 @@ def override(key: str, value: object) -> str:
     if not all(c.isalnum() or c in "/_-.+:" for c in text):
         # Hydra reads a backslash as itself, except before a quote.
         text = "'" + text.replace("\\'", "\\\\'").replace("'", "\\'") + "'"
-    return shlex.quote(f"{key}={text}")
+    word = f"{key}={text}"
+    plain = not set(word) & set('"$`\\!')  # what a shell reads inside double quotes
+    return f'"{word}"' if plain and "'" in word else shlex.quote(word)
