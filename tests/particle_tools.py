@@ -9,6 +9,7 @@ from contracts import ACTION, OBS, BeliefModuleContract
 from tensordict import TensorDict
 
 from torchrl_drbpn import ParticleFilter
+from torchrl_drbpn.functional import ParticleNoise
 
 K, HIDDEN, LATENT = 4, 6, 3
 OPTIONAL = (("belief", "observation"), ("belief", "latent"), ("belief", "effective_sample_size"))
@@ -27,3 +28,10 @@ def make_filter(
 
 def make_frames(shape: tuple[int, ...], seed: int = 0) -> TensorDict:
     return BeliefModuleContract().make_frames(shape, torch.float64, seed)
+
+
+def sample_noise(shape: tuple[int, ...], particles: int, latent: int, seed: int) -> ParticleNoise:
+    """The float64 noise of independent steps."""
+    g = torch.Generator().manual_seed(seed)
+    proposal = torch.randn(*shape, particles, latent, generator=g, dtype=torch.float64)
+    return ParticleNoise(proposal, torch.rand(*shape, 1, generator=g, dtype=torch.float64))

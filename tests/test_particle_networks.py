@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from particle_tools import HIDDEN, K, make_filter, make_frames
+from particle_tools import HIDDEN, K, make_filter, make_frames, sample_noise
 from tensordict import TensorDict
 from torch import Tensor
 from torch.distributions import Normal
@@ -29,9 +29,7 @@ def run(
 ) -> tuple[ParticleOutput, ParticleNoise]:
     """Sequences from zeros, with the noise they were given."""
     shape, count = data.shape, filter.num_particles
-    noise = ParticleNoise.sample(
-        shape, count, filter.latent_dim, torch.Generator().manual_seed(1), torch.float64
-    )
+    noise = sample_noise(shape, count, filter.latent_dim, 1)
     hidden = torch.zeros(*shape, count, filter.hidden_dim, dtype=torch.float64)
     begin = torch.zeros(shape, dtype=torch.bool) if begin is None else begin
     parts = (data["previous_action"], data["observation"], data["observed"])
@@ -159,8 +157,8 @@ def test_variances_never_fall_under_their_floor():
     action = filter.action_encoder(data["previous_action"])
     inputs = networks.share(torch.cat([seen, action], -1), action)
     hidden = torch.zeros(2, K, HIDDEN, dtype=torch.float64)
-    prospect = networks.prospect(hidden, inputs)
-    outcome = networks.outcome(prospect.proposal.mean, hidden, prospect.context, inputs)
+    prospect = networks.propose(hidden, inputs)
+    outcome = networks.step(prospect.proposal.mean, hidden, prospect.context, inputs)
     for gaussian, floor in (
         (prospect.proposal, 0.1),
         (prospect.transition, 0.1),

@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 import torch
+from particle_tools import sample_noise
 from torch import Tensor
 from torch.distributions import Normal
 
 from torchrl_drbpn.functional import (
     Belief,
     DiagonalGaussian,
-    Outcome,
-    ParticleNoise,
-    Prospect,
+    ParticleStep,
+    ProposalOutput,
     StateSpace,
     diagonal_log_density,
     effective_sample_size,
@@ -97,28 +97,28 @@ class LinearGaussian:
         self.Q, self.R, self.c = 0.2 + torch.rand(3, 3, generator=g, dtype=torch.float64)
         self.exact = exact
 
-    def prospect(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> Prospect:
+    def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:
         action, x, m = (part.unsqueeze(-2) for part in inputs)
         mean = hidden @ self.A.mT + action @ self.B.mT
         transition = DiagonalGaussian(mean, self.Q.expand_as(mean))
         if not self.exact:
-            return Prospect(DiagonalGaussian(mean, 1.5 * transition.variance), transition)
+            return ProposalOutput(DiagonalGaussian(mean, 1.5 * transition.variance), transition)
         gain = m * self.Q * self.c / (self.c.square() * self.Q + self.R)
         variance = ((1 - gain * self.c) * self.Q).expand_as(mean)
-        return Prospect(DiagonalGaussian(mean + gain * (x - self.c * mean), variance), transition)
+        return ProposalOutput(
+            DiagonalGaussian(mean + gain * (x - self.c * mean), variance), transition
+        )
 
-    def outcome(
+    def step(
         self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
-    ) -> Outcome:
+    ) -> ParticleStep:
         emission = DiagonalGaussian(self.c * latent, self.R.expand_as(latent))
-        return Outcome(emission, latent, latent)
+        return ParticleStep(emission, latent, latent)
 
     def run(self, data: tuple[Tensor, ...], particles: int, seeds: int) -> Tensor:
         """Log-likelihood of the rows of `data`, (seeds, rows, time)."""
         x, m, action = (part.expand(seeds, *part.shape) for part in data)
-        noise = ParticleNoise.sample(
-            x.shape[:-1], particles, 3, torch.Generator().manual_seed(particles), torch.float64
-        )
+        noise = sample_noise(x.shape[:-1], particles, 3, particles)
         hidden = x.new_zeros(*x.shape[:-1], particles, 3)
         begin = torch.zeros(x.shape[:-1], dtype=torch.bool)
         inputs = (action, x, m.double())

@@ -12,7 +12,6 @@ Inside a docstring k counts particles, K is their number, q the proposal, p the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -22,11 +21,11 @@ from torchrl_drbpn.functional.gaussian import LOG_2PI, zero_missing
 
 __all__ = [
     "DiagonalGaussian",
-    "Outcome",
     "ParticleModel",
     "ParticleNoise",
     "ParticleOutput",
-    "Prospect",
+    "ParticleStep",
+    "ProposalOutput",
     "diagonal_log_density",
     "effective_sample_size",
     "log_mean_weight",
@@ -43,11 +42,6 @@ class DiagonalGaussian(NamedTuple):
     Args:
         mean: shape ``(*batch, dim)``.
         variance: shape ``(*batch, dim)`` or one that broadcasts to it, positive.
-
-    Example:
-        >>> import torch
-        >>> DiagonalGaussian(torch.zeros(3, 2), torch.ones(2)).mean.shape
-        torch.Size([3, 2])
     """
 
     mean: Tensor
@@ -62,60 +56,19 @@ class ParticleNoise(NamedTuple):
             proposal's mean plus this times its standard deviation.
         resampling: uniform on [0, 1), shape ``(*batch, [time,] 1)``; where systematic resampling
             begins.
-
-    Example:
-        >>> import torch
-        >>> noise = ParticleNoise.sample((4,), 10, 3, torch.Generator().manual_seed(0))
-        >>> noise.proposal.shape, noise.resampling.shape
-        (torch.Size([4, 10, 3]), torch.Size([4, 1]))
     """
 
     proposal: Tensor
     resampling: Tensor
 
-    @classmethod
-    def sample(
-        cls,
-        shape: Sequence[int],
-        particles: int,
-        latent: int,
-        generator: torch.Generator,
-        dtype: torch.dtype | None = None,
-    ) -> ParticleNoise:
-        """Draw the noise of independent steps.
 
-        Args:
-            shape: ``(*batch, [time])``.
-            particles: K.
-            latent: components of z.
-            generator: every number comes from it; its device is that of the result.
-            dtype: of the result.
-
-        Returns:
-            The noise.
-        """
-        given: dict[str, Any] = {
-            "generator": generator,
-            "dtype": dtype,
-            "device": generator.device,
-        }
-        proposal = torch.randn(*shape, particles, latent, **given)
-        return cls(proposal, torch.rand(*shape, 1, **given))
-
-
-class Prospect(NamedTuple):
-    """Hold what the particles expect of z before it is drawn.
+class ProposalOutput(NamedTuple):
+    """Hold what a model says of z before it is drawn.
 
     Args:
         proposal: q(z | h, x, a), each ``(*batch, particles, latent)``.
         transition: p(z | h, a), the same shapes.
-        context: anything else of the model that its ``outcome`` wants back.
-
-    Example:
-        >>> import torch
-        >>> gaussian = DiagonalGaussian(torch.zeros(10, 3), torch.ones(10, 3))
-        >>> Prospect(gaussian, gaussian).context is None
-        True
+        context: anything else of the model that its ``step`` wants back.
     """
 
     proposal: DiagonalGaussian
@@ -123,7 +76,7 @@ class Prospect(NamedTuple):
     context: Any = None
 
 
-class Outcome(NamedTuple):
+class ParticleStep(NamedTuple):
     """Hold what follows from a z.
 
     Args:
@@ -131,12 +84,6 @@ class Outcome(NamedTuple):
         hidden: the next h, shape ``(*batch, particles, hidden)``.
         embedding: what else of a particle is handed on beside h, such as features of z, shape
             ``(*batch, particles, embedding)``.
-
-    Example:
-        >>> import torch
-        >>> emission = DiagonalGaussian(torch.zeros(10, 5), torch.ones(10, 5))
-        >>> Outcome(emission, torch.zeros(10, 4), torch.zeros(10, 3)).hidden.shape
-        torch.Size([10, 4])
     """
 
     emission: DiagonalGaussian
@@ -151,12 +98,12 @@ class ParticleModel(Protocol):
     step's observation, mask and action, the same for every particle of a row.
     """
 
-    def prospect(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> Prospect:
+    def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:
         """Return q(z | h, x, a) and p(z | h, a)."""
 
-    def outcome(
+    def step(
         self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
-    ) -> Outcome:
+    ) -> ParticleStep:
         """Return p(x | h, z, a) and the next h."""
 
 
@@ -170,10 +117,6 @@ class ParticleOutput(NamedTuple):
         embedding: shape ``(*batch, [time,] particles, embedding)``.
         latent: z, shape ``(*batch, [time,] particles, latent)``.
         expected: mean of the emission, shape ``(*batch, [time,] particles, obs)``.
-
-    Example:
-        >>> ParticleOutput._fields[:3]
-        ('hidden', 'log_weight', 'log_likelihood')
     """
 
     hidden: Tensor
@@ -213,13 +156,11 @@ def diagonal_log_density(
         True
     """
     mean, variance = gaussian
-    if observed is None:
-        terms = (value - mean).square() / variance + variance.log() + LOG_2PI
-        return -0.5 * terms.sum(-1)
-    # Zero first, subtract after: a NaN under a False mask must reach neither value nor gradient.
-    value = zero_missing(value, observed)
+    if observed is not None:
+        # Before any arithmetic: a NaN under a False mask must reach neither value nor gradient.
+        value = zero_missing(value, observed)
     terms = (value - mean).square() / variance + variance.log() + LOG_2PI
-    return -0.5 * zero_missing(terms, observed).sum(-1)
+    return -0.5 * (terms if observed is None else zero_missing(terms, observed)).sum(-1)
 
 
 def log_mean_weight(log_weight: Tensor) -> Tensor:
@@ -344,39 +285,24 @@ def particle_step(
     Returns:
         The particles after the step.
 
-    Example:
-        >>> import torch
-        >>> class Walk:  # z = h + noise, seen with noise; proposed from the transition itself
-        ...     def prospect(self, hidden, inputs):
-        ...         moved = DiagonalGaussian(hidden, torch.ones_like(hidden))
-        ...         return Prospect(moved, moved)
-        ...     def outcome(self, latent, hidden, context, inputs):
-        ...         seen = DiagonalGaussian(latent, torch.ones_like(latent))
-        ...         return Outcome(seen, latent, latent)
-        >>> noise = ParticleNoise.sample((2,), 8, 3, torch.Generator().manual_seed(0))
-        >>> nothing = torch.zeros(2, 3, dtype=torch.bool)
-        >>> out = particle_step(
-        ...     Walk(), torch.zeros(2, 8, 3), torch.zeros(2, 8), (), torch.zeros(2, 3), nothing,
-        ...     noise)
-        >>> bool((out.log_likelihood.abs() < 1e-6).all())  # q = p and nothing seen: weight 1
-        True
+    See also :func:`particle_sequence`, whose example has a model.
     """
     hidden = resample(hidden, systematic_ancestors(log_weight, noise.resampling))
-    proposal, transition, context = model.prospect(hidden, inputs)
+    proposal, transition, context = model.propose(hidden, inputs)
     latent = proposal.mean + proposal.variance.sqrt() * noise.proposal
-    outcome = model.outcome(latent, hidden, context, inputs)
+    step = model.step(latent, hidden, context, inputs)
     # log p - log q: the constants cancel, and (z - mean_q)^2 / variance_q is the noise squared.
     surprise = (latent - transition.mean).square() / transition.variance
     ratio = noise.proposal.square() - surprise + (proposal.variance / transition.variance).log()
-    seen = diagonal_log_density(observation.unsqueeze(-2), outcome.emission, observed.unsqueeze(-2))
+    seen = diagonal_log_density(observation.unsqueeze(-2), step.emission, observed.unsqueeze(-2))
     log_weight = 0.5 * ratio.sum(-1) + seen
     return ParticleOutput(
-        outcome.hidden,
+        step.hidden,
         log_weight,
         log_mean_weight(log_weight),
-        outcome.embedding,
+        step.embedding,
         latent,
-        outcome.emission.mean,
+        step.emission.mean,
     )
 
 
@@ -409,20 +335,20 @@ def particle_sequence(
 
     Example:
         >>> import torch
-        >>> class Walk:
-        ...     def prospect(self, hidden, inputs):
+        >>> class Walk:  # z = h + noise, seen with noise; proposed from the transition itself
+        ...     def propose(self, hidden, inputs):
         ...         moved = DiagonalGaussian(hidden, torch.ones_like(hidden))
-        ...         return Prospect(moved, moved)
-        ...     def outcome(self, latent, hidden, context, inputs):
+        ...         return ProposalOutput(moved, moved)
+        ...     def step(self, latent, hidden, context, inputs):
         ...         seen = DiagonalGaussian(latent, torch.ones_like(latent))
-        ...         return Outcome(seen, latent, latent)
-        >>> noise = ParticleNoise.sample((2, 5), 8, 3, torch.Generator().manual_seed(0))
-        >>> x, m = torch.randn(2, 5, 3), torch.ones(2, 5, 3, dtype=torch.bool)
+        ...         return ParticleStep(seen, latent, latent)
+        >>> noise = ParticleNoise(torch.randn(2, 5, 8, 3), torch.rand(2, 5, 1))
+        >>> start, nothing = torch.zeros(2, 5, 8, 3), torch.zeros(2, 5, 3, dtype=torch.bool)
         >>> out = particle_sequence(
-        ...     Walk(), torch.zeros(2, 5, 8, 3), torch.zeros(2, 5, 8),
-        ...     torch.zeros(2, 5, dtype=torch.bool), (), x, m, noise)
-        >>> out.hidden.shape, out.log_likelihood.shape
-        (torch.Size([2, 5, 8, 3]), torch.Size([2, 5]))
+        ...     Walk(), start, start[..., 0], nothing[..., 0], (), torch.zeros(2, 5, 3), nothing,
+        ...     noise)
+        >>> bool((out.log_likelihood.abs() < 1e-6).all())  # q = p and nothing seen: weight 1
+        True
     """
     dim = observation.ndim - 2  # time
     steps = zip(

@@ -12,10 +12,10 @@ from torch.nn.functional import linear, softplus
 
 from torchrl_drbpn.functional import (
     DiagonalGaussian,
-    Outcome,
     ParticleNoise,
     ParticleOutput,
-    Prospect,
+    ParticleStep,
+    ProposalOutput,
     particle_sequence,
     zero_missing,
 )
@@ -69,7 +69,7 @@ class ParticleFilter(nn.Module):
         >>> filter = ParticleFilter(5, 2, num_particles=4, hidden_dim=8, latent_dim=3)
         >>> action, x = torch.zeros(6, 10, 2), torch.randn(6, 10, 5)
         >>> observed = torch.rand(6, 10, 5) < 0.7
-        >>> noise = ParticleNoise.sample((6, 10), 4, 3, torch.Generator().manual_seed(0))
+        >>> noise = filter.noise(action, x, observed, torch.zeros(6, 10, 1).long())
         >>> start = torch.zeros(6, 10, dtype=torch.bool)
         >>> out = filter(
         ...     torch.zeros(6, 10, 4, 8), torch.zeros(6, 10, 4), start, action, x, observed, noise)
@@ -354,7 +354,7 @@ class _Networks(NamedTuple):
         from_action = linear(action, self.moved, self.moved_bias)
         return from_seen, from_action
 
-    def prospect(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> Prospect:
+    def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:
         h, parts = self.parts.hidden_dim, self.parts
         from_seen, from_action = (part.unsqueeze(-2) for part in inputs)
         last = parts.emission.out_features
@@ -364,11 +364,11 @@ class _Networks(NamedTuple):
         floor = parts.latent_min_std**2
         proposal = _gaussian(parts.proposal_head((to_q + seen_q).relu()), floor)
         transition = _gaussian(parts.transition_head((to_p + action_p).relu()), floor)
-        return Prospect(proposal, transition, (to_x + action_x, to_gates, seen_gates))
+        return ProposalOutput(proposal, transition, (to_x + action_x, to_gates, seen_gates))
 
-    def outcome(
+    def step(
         self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
-    ) -> Outcome:
+    ) -> ParticleStep:
         del inputs
         parts, h = self.parts, self.parts.hidden_dim
         to_x, own_gates, seen_gates = context
@@ -382,7 +382,7 @@ class _Networks(NamedTuple):
         inner = own_gates + self.gate_bias
         reset, keep = (outer[..., : 2 * h] + inner[..., : 2 * h]).sigmoid().chunk(2, -1)
         fresh = (outer[..., 2 * h :] + reset * inner[..., 2 * h :]).tanh()
-        return Outcome(emission, fresh + keep * (hidden - fresh), embedding)
+        return ParticleStep(emission, fresh + keep * (hidden - fresh), embedding)
 
 
 def _gaussian(raw: Tensor, floor: float) -> DiagonalGaussian:
