@@ -40,12 +40,10 @@ def test_every_size_equals_the_pytorch_form(batch, time, state, obs):
 
 def row(problem: Problem) -> tuple:
     """The operator's arguments."""
-    model, (mean, action, x, seen, reset) = problem.model(), problem.arguments()
-    tensors = native._model_tensors(model, model.transition, model.transition_cov)
-    stored = problem.stored()
+    mean, action, x, seen, reset = problem.arguments()
     return (
-        x, seen, action, reset, stored["use_stored_state"], stored["stored_mean"], mean, tensors,
-        True, True,
+        x, seen, action, reset, *problem.stored().values(), mean,
+        *native.operator_arguments(problem.model()),
     )  # fmt: skip
 
 
@@ -68,7 +66,7 @@ def test_a_tape_has_the_size_that_the_c_code_lays_out():
 
     for obs in (3, 5, 17):
         arguments = row(Problem(3, obs))
-        sizes = native._Sizes(arguments[:7], arguments[7], arguments[8:])
+        sizes = native._Sizes(*arguments)
         counts = (ctypes.c_int64 * 3)()
         native._library().sizes_double((ctypes.c_int64 * 20)(*sizes.numbers), counts)
         assert sizes.tape == counts[0]
@@ -76,13 +74,13 @@ def test_a_tape_has_the_size_that_the_c_code_lays_out():
 
 @built
 def test_vmap_over_it_equals_a_loop():
-    arguments = row(Problem(3, 5, stored=True))
-    many = [x.detach().expand(2, *x.shape) * torch.ones(2, *[1] * x.ndim) for x in arguments[7]]
+    arguments = [x.detach() if isinstance(x, torch.Tensor) else x for x in row(Problem(3, 5))]
     observation = torch.stack([arguments[0], 2 * arguments[0]], -1)
-    run = lambda x, model: operator(x, *arguments[1:7], model, True, True)[:2]  # noqa: E731
-    found = torch.vmap(run, in_dims=(-1, 0))(observation, many)
+    networks = torch.stack([arguments[14], -arguments[14]])
+    run = lambda x, f: operator(x, *arguments[1:14], f, *arguments[15:])[:2]  # noqa: E731
+    found = torch.vmap(run, in_dims=(-1, 0))(observation, networks)
     for i in range(2):
-        expected = run(observation[..., i], [x[i] for x in many])
+        expected = run(observation[..., i], networks[i])
         for a, b in zip(found, expected, strict=True):
             assert torch.equal(a[i], b)
 
@@ -139,27 +137,28 @@ def test_what_it_does_not_take_it_names():
 # --- wrong arguments ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", range(7))
-@pytest.mark.parametrize("spoil", ["size", "dtype", "dimension"])
-def test_a_wrong_tensor_of_a_sequence_never_reaches_c(place, spoil):
+@pytest.mark.parametrize("place", range(15))
+@pytest.mark.parametrize("spoil", ["size", "dtype", "dimension", "device"])
+def test_a_wrong_tensor_never_reaches_c(place, spoil):
     arguments = list(row(Problem(3, 5, stored=True)))
     x = arguments[place]
-    wrong = {"size": x[..., :-1], "dtype": x.to(torch.int32), "dimension": x[0]}[spoil]
-    arguments[place] = wrong
-    with pytest.raises(ValueError, match=r"must be|float32 or float64"):
+    spoilt = {
+        "size": x[..., :-1], "dtype": x.to(torch.int32), "dimension": x.unsqueeze(0),
+        "device": x.to("meta"),
+    }  # fmt: skip
+    arguments[place] = spoilt[spoil]
+    with pytest.raises(
+        (ValueError, NotImplementedError, RuntimeError), match=r"must be|meta|device"
+    ):
         operator(*arguments)
 
 
-@pytest.mark.parametrize("place", range(11))
-def test_a_wrong_tensor_of_a_model_never_reaches_c(place):
-    arguments = row(Problem(3, 5))
-    for wrong in (lambda x: x[..., :-1], lambda x: x.float(), lambda x: x.unsqueeze(0)):
-        model = list(arguments[7])
-        model[place] = wrong(model[place])
-        with pytest.raises(ValueError, match=r"must be|no size|float32 or float64"):
-            operator(*arguments[:7], model, *arguments[8:])
-    with pytest.raises(ValueError, match="7 tensors and layers of two"):
-        operator(*arguments[:7], arguments[7][:-1], *arguments[8:])
+@pytest.mark.parametrize("widths", [[], [5], [5, 4], [3], [0, 3], [-5, 3], [5, 3, 3]], ids=str)
+def test_widths_that_are_not_the_networks_never_reach_c(widths):
+    arguments = list(row(Problem(3, 5)))
+    arguments[15] = widths
+    with pytest.raises(ValueError, match=r"must be|last width|no size"):
+        operator(*arguments)
 
 
 @built

@@ -23,7 +23,13 @@ from torch.autograd import forward_ad
 
 from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
 
-__all__ = ["filter_rows", "native_status", "register_gradient", "unsupported_reason"]
+__all__ = [
+    "filter_rows",
+    "native_status",
+    "operator_arguments",
+    "register_gradient",
+    "unsupported_reason",
+]
 
 _KINDS = {torch.float32: "float", torch.float64: "double"}
 _WIDTHS = {"AVX512": "avx512", "AVX2": "avx2"}
@@ -91,7 +97,8 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     f, Q = model.transition, model.transition_cov
     if not isinstance(f, TransitionMLP) or not isinstance(Q, Tensor):
         return "it takes a TransitionMLP with a constant transition_cov"
-    given = [x for x in (*_model_tensors(model, f, Q), *tensors) if x is not None]
+    own = (Q, *list(vars(model).values())[2:], *f.weights, *f.biases)
+    given = [x for x in (*own, *tensors) if x is not None]
     if torch.compiler.is_compiling():
         return "torch.compile and torch.export trace PyTorch's operations"
     # functorch has no public word for "a transformation is running", and a tensor under one looks
@@ -124,15 +131,6 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     return reason
 
 
-def _model_tensors(model: StateSpace, f: TransitionMLP, Q: Tensor) -> list[Tensor]:
-    """Return the model as the operator takes it: seven tensors, then weight, bias, ..."""
-    return [
-        Q, model.initial_cov, model.emission_cov, model.emission_matrix, model.action_matrix,
-        model.emission_offset, model.initial_mean,
-        *itertools.chain.from_iterable(zip(f.weights, f.biases, strict=True)),
-    ]  # fmt: skip
-
-
 def filter_rows(model: StateSpace, sequence: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
     """Filter rows of sequences by the operator.
 
@@ -156,43 +154,53 @@ def filter_rows(model: StateSpace, sequence: Sequence[Tensor | None]) -> tuple[T
         >>> native_status() is not None or bool((filter_rows(model, rows)[0] == 1).all())
         True
     """
-    f = model.transition
-    assert isinstance(f, TransitionMLP)  # the rule saw to it; for the type checker
-    tensors = _model_tensors(model, f, model.constant_cov())
-    tensors[1] = model.full_initial_cov()
     mean, log_likelihood, _ = torch.ops.torchrl_drbpn.filter_rows(
-        *sequence, tensors, f.residual, f.activation == "tanh"
+        *sequence, *operator_arguments(model)
     )
     return mean, log_likelihood
 
 
+def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
+    """Return a model as the operator takes it: Q, P_0, R, H, B, d, m_0, the network in one piece.
+
+    Args:
+        model: a model that :func:`unsupported_reason` has nothing against.
+
+    Returns:
+        Eight tensors, the widths of the network's layers, whether it is residual, and whether it
+        has tanh between its layers. One tensor, as autograd is slow on lists of them.
+    """
+    f = model.transition
+    assert isinstance(f, TransitionMLP)  # the rule saw to it; for the type checker
+    layers = itertools.chain.from_iterable(zip(f.weights, f.biases, strict=True))
+    return (
+        model.constant_cov(), model.full_initial_cov(), model.emission_cov, model.emission_matrix,
+        model.action_matrix, model.emission_offset, model.initial_mean,
+        torch.cat([x.reshape(-1) for x in layers]), [len(bias) for bias in f.biases],
+        f.residual, f.activation == "tanh",
+    )  # fmt: skip
+
+
 # ------------------------------------------------------------------ the operator
-_SEQUENCE = (
+_ARGUMENTS = (
     "Tensor observation, Tensor observed, Tensor action, Tensor reset, Tensor? use_stored, "
-    "Tensor? stored, Tensor start"
+    "Tensor? stored, Tensor start, Tensor Q, Tensor P0, Tensor R, Tensor H, Tensor B, Tensor d, "
+    "Tensor m0, Tensor network, int[] widths, bool residual, bool tanh"
 )
 _LIBRARY: Any = torch.library.Library("torchrl_drbpn", "DEF")  # type: ignore[no-untyped-call]
+_LIBRARY.define(f"filter_rows({_ARGUMENTS}) -> (Tensor, Tensor, Tensor)")
 _LIBRARY.define(
-    f"filter_rows({_SEQUENCE}, Tensor[] model, bool residual, bool tanh) "
-    "-> (Tensor, Tensor, Tensor)"
-)
-_LIBRARY.define(
-    f"filter_rows_backward(Tensor? by_mean, Tensor? by_log_likelihood, Tensor tape, {_SEQUENCE}, "
-    "Tensor[] model, bool residual, bool tanh) -> Tensor[]"
+    "filter_rows_backward(Tensor? by_mean, Tensor? by_log_likelihood, Tensor tape, "
+    f"{_ARGUMENTS}) -> Tensor[]"
 )
 
 
 class _Sizes:
     """Check the tensors of a call, and hold its sizes as memory.h reads them."""
 
-    def __init__(
-        self, sequence: Sequence[Tensor | None], model: Sequence[Tensor], flags: tuple[bool, bool]
-    ) -> None:
-        observation, _, action, _, use_stored, stored, start = sequence
-        if len(model) < 9 or len(model) % 2 == 0:
-            raise ValueError(f"`model` must hold 7 tensors and layers of two, got {len(model)}.")
-        if observation is None or action is None or start is None:
-            raise ValueError("only `use_stored` and `stored` may be None.")
+    def __init__(self, *arguments: Any) -> None:
+        observation, _, action, _, use_stored, stored, start, *model = arguments[:15]
+        layers, residual, tanh = arguments[15:]
         if observation.ndim != 3 or action.ndim != 3 or start.ndim != 2:
             raise ValueError(
                 "`observation` and `action` must be (batch, time, n), `start` (batch, n)."
@@ -200,18 +208,16 @@ class _Sizes:
         batch, time, obs = observation.shape
         state, self.actions = start.shape[1], action.shape[2]
         R = model[2]
-        widths = [state + self.actions, *(len(bias) for bias in model[8::2])]
+        widths = [state + self.actions, *layers]
         self.information = R.ndim == 1 and obs > state
         shapes: list[tuple[int, ...]] = [
             (batch, time, obs), (batch, time, obs), (batch, time, self.actions), (batch, time),
             (batch, time), (batch, time, state), (batch, state), (state, state), (state, state),
             (obs,) * min(2, max(1, R.ndim)), (obs, state), (obs, self.actions), (obs,), (state,),
+            (sum(n * (m + 1) for m, n in itertools.pairwise(widths)),),
         ]  # fmt: skip
-        for fan_in, fan_out in itertools.pairwise(widths):
-            shapes += [(fan_out, fan_in), (fan_out,)]
-        every = [*sequence, *model]
         self.dtype = observation.dtype
-        for i, (x, shape) in enumerate(zip(every, shapes, strict=True)):
+        for i, (x, shape) in enumerate(zip(arguments[:15], shapes, strict=True)):
             dtype = torch.bool if i in (1, 3, 4) else self.dtype
             if x is not None and (x.shape != shape or x.dtype != dtype or x.device != start.device):
                 raise ValueError(
@@ -221,24 +227,35 @@ class _Sizes:
         size = state if self.information else obs
         if (
             self.dtype not in _KINDS
+            or not layers
             or widths[-1] != state
             or (use_stored is None) != (stored is None)
         ):
-            raise ValueError("float32 or float64, f of width state, `use_stored` beside `stored`.")
-        if size > _MAX_SIZE or len(widths) > _MAX_LAYERS + 1 or not all(map(min, shapes)):
+            raise ValueError("float32 or float64, last width state, `use_stored` beside `stored`.")
+        smallest = min(*widths, *(n for shape in shapes for n in shape))
+        if size > _MAX_SIZE or len(layers) > _MAX_LAYERS or smallest < 1:
             raise ValueError(f"no size may be 0, none factorised over {_MAX_SIZE}; got {shapes}.")
         self.batch, self.time, self.obs, self.state = batch, time, obs, state
         self.numbers = [
-            batch, time, obs, state, self.actions, len(widths) - 1, flags[0], not flags[1],
-            R.ndim == 2, state, self.information, *widths[1:],
+            batch, time, obs, state, self.actions, len(layers), residual, not tanh,
+            R.ndim == 2, state, self.information, *layers,
         ]  # fmt: skip
         N, S, J, *W = map(_padded, (obs, state, *widths))
         entries = state * (state + 1) // 2 if self.information else obs * obs
         beside = batch * time * S if self.information else 2 * (state * N + obs * S)
         rows = batch * time
+        self.widths = widths
         self.tape = rows * (2 * J + N + sum(W[:-1])) + _padded(rows) * entries + beside
 
-    def call(self, name: str, pointers: Sequence[Tensor | None], scratch_at: int) -> None:
+    def layers(self, network: Tensor) -> list[int]:
+        """Return the addresses of weight, bias, weight, ... in a network."""
+        at, found = network.data_ptr(), []
+        for fan_in, fan_out in itertools.pairwise(self.widths):
+            found += [at, at + fan_out * fan_in * network.itemsize]
+            at = found[-1] + fan_out * network.itemsize
+        return found
+
+    def call(self, name: str, pointers: Sequence[Tensor | int | None], scratch_at: int) -> None:
         """Call a function of the library; a scratch of the size it asks for goes in between."""
         library = _library()
         if isinstance(library, str):
@@ -250,7 +267,7 @@ class _Sizes:
         scratch = torch.empty(counts[1 + (name == "backward")], dtype=torch.float64)
         every = [*pointers[:scratch_at], scratch, *pointers[scratch_at:]]
         found = (ctypes.c_void_p * len(every))(
-            *(None if x is None else x.data_ptr() for x in every)
+            *(x.data_ptr() if isinstance(x, Tensor) else x for x in every)
         )
         getattr(library, f"{name}_{kind}")(dims, found)
 
@@ -259,8 +276,8 @@ def _padded(n: int) -> int:
     return (n + _LANES - 1) // _LANES * _LANES
 
 
-def _dense(tensors: Sequence[Tensor | None]) -> list[Any]:
-    return [None if x is None else x.contiguous() for x in tensors]
+def _dense(arguments: Sequence[Any]) -> list[Any]:
+    return [x.contiguous() if isinstance(x, Tensor) else x for x in arguments]
 
 
 def _inverses(sizes: _Sizes, model: Sequence[Tensor]) -> tuple[list[Tensor], Tensor | None]:
@@ -272,52 +289,46 @@ def _inverses(sizes: _Sizes, model: Sequence[Tensor]) -> tuple[list[Tensor], Ten
     return list(inverse), 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def _forward(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
-    sequence, model, flags = _dense(args[:7]), _dense(args[7]), args[8:]
-    sizes = _Sizes(sequence, model, flags)
-    x, observed, _, reset, *_ = sequence
+def _forward(*given: Any) -> tuple[Tensor, Tensor, Tensor]:
+    sizes, arguments = _Sizes(*given), _dense(given)
+    x, observed, reset, model = arguments[0], arguments[1], arguments[3], arguments[7:15]
     mean = x.new_empty(sizes.batch, sizes.time, sizes.state)
     ll = x.new_empty(sizes.batch, sizes.time, dtype=torch.float64)
     tape = x.new_empty(sizes.tape, dtype=torch.float64)
     priors, log_det = _inverses(sizes, model)
-    sizes.call("forward", [*sequence, *priors, *model[2:7], mean, ll, tape, *model[7:]], 17)
+    layers = sizes.layers(model[7])
+    sizes.call("forward", [*arguments[:7], *priors, *model[2:7], mean, ll, tape, *layers], 17)
     if log_det is not None:
         ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
         ll = torch.where(observed.any(-1), ll, 0.0)
     return mean, ll.to(x.dtype), tape
 
 
-def _backward(*args: Any) -> list[Tensor]:
-    """Return the gradients by observation, action, stored mean, start and each of the model."""
-    by_mean, by_ll, tape, *_ = args
-    sequence, model, flags = _dense(args[3:10]), _dense(args[10]), args[11:]
-    sizes = _Sizes(sequence, model, flags)
-    x, observed, action, reset, use_stored, stored, start = sequence
+def _backward(by_mean: Tensor | None, by_ll: Tensor | None, *rest: Any) -> list[Tensor]:
+    """Return the gradients by observation, action, stored mean, start and the model's tensors."""
+    tape, *given = rest
+    sizes, arguments = _Sizes(*given), _dense(given)
+    x, observed, action, reset, use_stored, stored, start, *model = arguments[:15]
     if tape.shape != (sizes.tape,) or tape.dtype != torch.float64 or not tape.is_contiguous():
         raise ValueError("`tape` must be what filter_rows returned for the same inputs.")
     for by, shape in ((by_mean, (*reset.shape, sizes.state)), (by_ll, reset.shape)):
         if by is not None and (by.shape != shape or by.dtype != x.dtype):
             raise ValueError("`by_mean` and `by_log_likelihood` must be like the outputs.")
     by_mean = None if by_mean is None else by_mean.contiguous()
-    if by_ll is not None:
-        by_ll = by_ll.double().contiguous()
+    by_ll = None if by_ll is None else by_ll.double().contiguous()
     priors, log_det = _inverses(sizes, model)
     if log_det is not None and by_ll is not None:
         by_ll = torch.where(observed.any(-1), by_ll, 0.0)
-    by_inputs = [
-        torch.empty_like(v) for v in (x, action, start if stored is None else stored, start)
-    ]
-    by_model = [torch.empty_like(v) for v in model]
-    Q, P0, R, H, B, _, _, *layers = model
-    if log_det is not None:
-        Q, P0 = priors
-        by_model[:2] = [torch.empty_like(prior) for prior in priors]
+    by_inputs = [torch.empty_like(v) for v in (x, action, stored, start) if v is not None]
+    by_stored = None if stored is None else by_inputs[2]
+    by_model = [torch.empty_like(v) for v in (*priors, *model[2:])]
+    _, _, R, H, B, _, _, network = model
     sizes.call(
         "backward",
         [
-            by_mean, by_ll, reset, use_stored, Q, P0, H, B, tape, *by_inputs[:2],
-            None if stored is None else by_inputs[2], by_inputs[3], *by_model[:7], observed, R,
-            *layers[0::2], *by_model[7:],
+            by_mean, by_ll, reset, use_stored, *priors, H, B, tape, *by_inputs[:2], by_stored,
+            by_inputs[-1], *by_model[:7], observed, R, *sizes.layers(network)[::2],
+            *sizes.layers(by_model[7]),
         ],
         9,
     )  # fmt: skip
@@ -330,21 +341,20 @@ def _backward(*args: Any) -> list[Tensor]:
     return [*by_inputs, *by_model]
 
 
-def _forward_fake(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
-    x, sizes = args[0], _Sizes(args[:7], args[7], args[8:])
+def _forward_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+    x, sizes = arguments[0], _Sizes(*arguments)
     mean = x.new_empty(sizes.batch, sizes.time, sizes.state)
     return mean, x.new_empty(mean.shape[:2]), x.new_empty(sizes.tape, dtype=torch.float64)
 
 
-def _backward_fake(*args: Any) -> list[Tensor]:
-    x, _, action, _, _, stored, start = args[3:10]
-    inputs = (x, action, start if stored is None else stored, start)
-    return [torch.empty_like(v) for v in (*inputs, *args[10])]
+def _backward_fake(*arguments: Any) -> list[Tensor]:
+    x, _, action, _, _, stored, start, *model = arguments[3:18]
+    return [torch.empty_like(v) for v in (x, action, stored, start, *model) if v is not None]
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    ctx.flags = inputs[8:]
-    ctx.save_for_backward(output[2], *inputs[:7], *inputs[7])
+    ctx.rest = inputs[15:]
+    ctx.save_for_backward(output[2], *inputs[:15])
     ctx.mark_non_differentiable(output[2])
     ctx.set_materialize_grads(False)
 
@@ -365,19 +375,19 @@ def register_gradient(pytorch_form: Callable[..., tuple[Tensor, Tensor]]) -> Non
     def gradient(ctx: Any, *by_outputs: Tensor | None) -> tuple[Any, ...]:
         tape, *saved = ctx.saved_tensors
         by_mean, by_ll, _ = by_outputs
-        sequence, model, (residual, tanh) = saved[:7], saved[7:], ctx.flags
         if not torch.is_grad_enabled():
-            found = torch.ops.torchrl_drbpn.filter_rows_backward(
-                by_mean, by_ll, tape, *sequence, model, residual, tanh
+            x, action, *stored, start, Q, P0, R, H, B, d, m0, network = (
+                torch.ops.torchrl_drbpn.filter_rows_backward(
+                    by_mean, by_ll, tape, *saved, *ctx.rest
+                )
             )
-            x, action, stored, start, *of_model = found
-            stored = None if sequence[5] is None else stored
-            return x, None, action, None, None, stored, start, of_model, None, None
-        Q, P0, R, H, B, d, m0, *layers = model
-        f = TransitionMLP(
-            tuple(layers[::2]), tuple(layers[1::2]), residual, "tanh" if tanh else "relu"
+            of_stored = stored[0] if stored else None
+            sequence = (x, None, action, None, None, of_stored, start)
+            return (*sequence, Q, P0, R, H, B, d, m0, network, None, None, None)
+        Q, P0, R, H, B, d, m0, network = saved[7:]
+        outputs = pytorch_form(
+            StateSpace(_unpacked(network, Q, B, *ctx.rest), Q, H, R, B, d, m0, P0), *saved[:7]
         )
-        outputs = pytorch_form(StateSpace(f, Q, H, R, B, d, m0, P0), *sequence)
         wanted = [x for x in saved if x is not None and x.requires_grad]
         pairs = [(o, g) for o, g in zip(outputs, by_outputs[:2], strict=True) if g is not None]
         found = torch.autograd.grad(
@@ -388,21 +398,28 @@ def register_gradient(pytorch_form: Callable[..., tuple[Tensor, Tensor]]) -> Non
             allow_unused=True,
         )
         known = {id(x): g for x, g in zip(wanted, found, strict=True)}
-        every = [known.get(id(x)) for x in saved]
-        return *every[:7], every[7:], None, None
+        return *(known.get(id(x)) for x in saved), None, None, None
 
     torch.library.register_autograd(
         "torchrl_drbpn::filter_rows", gradient, setup_context=_setup_context, lib=_LIBRARY
     )
 
 
+def _unpacked(
+    network: Tensor, Q: Tensor, B: Tensor, widths: list[int], residual: bool, tanh: bool
+) -> TransitionMLP:
+    """Return the network that :func:`operator_arguments` put into one piece."""
+    pairs = list(itertools.pairwise([len(Q) + B.shape[1], *widths]))
+    parts = torch.split(network, [size for m, n in pairs for size in (n * m, n)])
+    weights = tuple(part.view(n, m) for part, (m, n) in zip(parts[::2], pairs, strict=True))
+    return TransitionMLP(weights, tuple(parts[1::2]), residual, "tanh" if tanh else "relu")
+
+
 def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], Any]:
     """Run the operator for one member of the batch after the other."""
 
     def member(value: Any, dim: Any, i: int) -> Any:
-        if isinstance(value, (list, tuple)):
-            return [member(v, d, i) for v, d in zip(value, dim, strict=True)]
-        return value if dim is None else value.select(dim, i)
+        return value.select(dim, i) if isinstance(dim, int) else value
 
     runs = [
         torch.ops.torchrl_drbpn.filter_rows(
