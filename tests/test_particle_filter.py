@@ -8,8 +8,6 @@ test_particles.py, its networks' laws in test_particle_networks.py.
 from __future__ import annotations
 
 import functools
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -196,21 +194,3 @@ def test_the_model_is_learned_by_the_loss_that_learns_the_belief_filter():
             optimizer.step()
             history.append(value.item())
     assert history[-1] < history[0] - 0.5
-
-
-# ------------------------------------------------------------------------------ the recipe's seam
-def test_the_recipe_builds_it_with_the_settings_of_conf():
-    pytest.importorskip("hydra")
-    from omegaconf import OmegaConf
-
-    root = Path(__file__).parents[1]
-    sys.path.insert(0, str(root / "recipes"))
-    from beliefs import build_belief
-
-    settings = OmegaConf.to_container(OmegaConf.load(root / "conf" / "belief" / "dvrl.yaml"))
-    belief = build_belief(settings, obs_dim=11, action_dim=3, normalize="entry")
-    filter = belief.module.filter
-    # conf/default.yaml and conf/mountainHike.yaml of the authors' code
-    assert (filter.num_particles, filter.hidden_dim, filter.latent_dim) == (10, 128, 256)
-    assert belief.feature_dim == 128
-    assert belief.model_loss is not None

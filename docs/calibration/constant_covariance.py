@@ -115,7 +115,8 @@ def trained_cov(
     action = torch.zeros(rows, time, 1, dtype=torch.float64)
     for _ in range(iterations):
         learned = replace(model, transition_cov=full_cov(raw, MIN_STD))
-        out = filter_sequence(learned, model.initial_mean, action, observation, observed, reset)
+        start = model.initial_mean.expand(len(observation), -1)
+        out = filter_sequence(learned, start, action, observation, observed, reset)
         optimiser.zero_grad()
         (-out.log_likelihood.sum() / observed.sum()).backward()
         optimiser.step()
