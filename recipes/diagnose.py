@@ -114,7 +114,7 @@ def _diagnoses(
         trained = load_trained_agent(folder)
         settings = trained.settings
         belief = str(settings.belief.get("name", ""))
-        if trained.belief.observing is None:
+        if trained.agent.observing is None:
             say(
                 f"{folder.name}: belief={belief} keeps no estimate of its sensors; the rows are "
                 "those of the last value and the running mean"
