@@ -282,7 +282,7 @@ def _run(
     gain, likelihood = gains(H, model.emission_cov.double(), every_step, observed)
     # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
     y = zero_missing(observation, observed).double() - model.offset(action).double()
-    predicted, moves, filtered = [], [], []
+    innovations, moves, filtered, H_t = [], [], [], H.mT
     steps = (y, gain, action, reset.unsqueeze(-1), use_stored_state, stored_mean)
     for y_t, gain_t, action_t, reset_t, use_t, stored_t in zip(
         *((None,) * y.shape[1] if x is None else x.unbind(1) for x in steps), strict=True
@@ -290,29 +290,30 @@ def _run(
         if use_t is not None:
             mean = torch.where(use_t.unsqueeze(-1), stored_t, mean)
         m = model.predicted_mean(mean, action_t, reset_t).double()
-        move = (gain_t @ (y_t - m @ H.mT).unsqueeze(-1)).squeeze(-1)
+        v = torch.addmm(y_t, m, H_t, alpha=-1)
+        move = torch.bmm(gain_t, v.unsqueeze(-1)).squeeze(-1)
         mean = (m + move).to(mean.dtype)
-        predicted.append(m)
+        innovations.append(v)
         moves.append(move)
         filtered.append(mean)
     if not filtered:
         return mean.unsqueeze(1)[:, :0], y.sum(-1).to(mean.dtype)
-    residual = zero_missing(y - torch.stack(predicted, 1) @ H.mT, observed)
-    ll = likelihood(residual, torch.stack(moves, 1))
+    residual = zero_missing(torch.stack(innovations, 1), observed)
+    ll = likelihood(residual, moves)
     return torch.stack(filtered, 1), torch.where(observed.any(-1), ll, 0.0).to(mean.dtype)
 
 
 def _innovation(
     H: Tensor, R: Tensor, every_step: EveryStep, observed: Tensor
-) -> tuple[Tensor, Callable[[Tensor, Tensor], Tensor]]:
+) -> tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]:
     """Return the gains K = P H' M' inv(M S M') M and the log-likelihood, obs x obs factorised."""
     full_R = R.diag() if R.ndim == 1 else R
     factor, log_det = _factor(masked_cov(every_step(lambda P: H @ P @ H.mT + full_R), observed))
     cross = every_step(lambda P: H @ P)
     gain = torch.cholesky_solve(zero_missing(cross, observed.unsqueeze(-1)), factor).mT
 
-    def likelihood(residual: Tensor, move: Tensor) -> Tensor:
-        del move
+    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
+        del moves
         white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
         count = observed.sum(-1).to(residual.dtype)  # an integer times a float would be float32
         return -0.5 * (white.squeeze(-1).square().sum(-1) + log_det + count * LOG_2PI)
@@ -322,7 +323,7 @@ def _innovation(
 
 def _information(
     H: Tensor, R: Tensor, every_step: EveryStep, observed: Tensor
-) -> tuple[Tensor, Callable[[Tensor, Tensor], Tensor]]:
+) -> tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]:
     r"""Return the gains K = inv(inv(P) + H' W H) H' W and the log-likelihood, W = diag(m / r).
 
     .. math::
@@ -341,7 +342,8 @@ def _information(
     log_det = log_det + every_step(lambda P: _factor(P)[1][..., None, None]).flatten(-3)
     gain = torch.cholesky_solve((weight.unsqueeze(-1) * H).mT, factor)
 
-    def likelihood(residual: Tensor, move: Tensor) -> Tensor:
+    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
+        move = torch.stack(moves, 1)
         left = zero_missing(residual - move @ H.mT, observed)
         by_prior = (prior @ move.unsqueeze(-1)).squeeze(-1)
         quadratic = (weight * left.square()).sum(-1) + (move * by_prior).sum(-1)

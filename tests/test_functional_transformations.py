@@ -1,0 +1,128 @@
+"""What PyTorch does to functions works on the filter: the values and gradients of a plain call."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from filter_problems import Problem, assert_equal
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.autograd import forward_ad
+
+from torchrl_drbpn.functional import filter_sequence
+
+SIZES = pytest.mark.parametrize("obs", [3, 5], ids=["innovation", "information"])
+
+
+def total(problem: Problem):
+    """A number of the start mean and of R, everything else fixed."""
+    problem.leaves = {name: leaf.detach() for name, leaf in problem.leaves.items()}
+    model, (_, *rest) = problem.model(), problem.arguments()
+    stored = problem.stored()
+
+    def run(start: Tensor, noise: Tensor) -> Tensor:
+        out = filter_sequence(replace(model, emission_cov=noise), start, *rest, **stored)
+        return out.mean.square().sum() + out.log_likelihood.sum()
+
+    return run, (problem.leaves["start_mean"], problem.leaves["noise"])
+
+
+@SIZES
+def test_func_grad_and_jvp_equal_autograd(obs):
+    run, given = total(Problem(3, obs, stored=True))
+    leaves = [x.clone().requires_grad_() for x in given]
+    expected = torch.autograd.grad(run(*leaves), leaves)
+    for a, b in zip(torch.func.grad(run, (0, 1))(*given), expected, strict=True):
+        assert_equal(a, b)
+    directions = tuple(torch.ones_like(x) for x in given)
+    slope = sum(g.sum() for g in expected)
+    assert_equal(torch.func.jvp(run, given, directions)[1], slope)
+    with forward_ad.dual_level():
+        duals = (forward_ad.make_dual(x, d) for x, d in zip(given, directions, strict=True))
+        assert_equal(forward_ad.unpack_dual(run(*duals)).tangent, slope)
+
+
+@SIZES
+def test_vmap_over_models_and_gradients_a_sample_equal_loops(obs):
+    run, (start, noise) = total(Problem(3, obs))
+    noises = torch.stack([noise, 2 * noise])
+    found = torch.vmap(torch.func.grad(run, 1), in_dims=(None, 0))(start, noises)
+    for a, b in zip(found, noises, strict=True):
+        assert_equal(a, torch.func.grad(run, 1)(start, b))
+
+
+@SIZES
+def test_compiled_in_one_graph_it_is_the_same(obs):
+    run, given = total(Problem(3, obs, stored=True, time=3))
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    leaves = [[x.clone().requires_grad_() for x in given] for _ in range(2)]
+    values = compiled(*leaves[0]), run(*leaves[1])
+    assert_equal(*values)
+    for value in values:
+        value.backward()
+    for a, b in zip(*leaves, strict=True):
+        assert_equal(a.grad, b.grad)
+
+
+@SIZES
+def test_exported_it_is_the_same(obs):
+    run, given = total(Problem(3, obs, time=3))
+
+    class Module(torch.nn.Module):
+        def forward(self, start: Tensor, noise: Tensor) -> Tensor:
+            return run(start, noise)
+
+    with torch.no_grad():
+        exported = torch.export.export(Module(), given, strict=False)
+        assert_equal(exported.module()(*given), run(*given))
+
+
+@SIZES
+def test_fake_and_meta_tensors_give_shapes(obs):
+    with FakeTensorMode():
+        problem = Problem.__new__(Problem)
+        problem.__dict__.update(_empty(3, obs, "cpu"))
+        assert tuple(problem.library("auto").mean.shape) == (2, 4, 3)
+    problem = Problem.__new__(Problem)
+    problem.__dict__.update(_empty(3, obs, "meta"))
+    out = problem.library("auto")
+    assert out.mean.is_meta
+    assert out.log_likelihood.shape == (2, 4)
+
+
+def _empty(state: int, obs: int, device: str) -> dict:
+    shapes = {
+        "observation": (2, 4, obs), "previous_action": (2, 4, 2), "start_mean": (2, state),
+        "transition_root": (state, state), "noise": (obs,), "matrix": (obs, state),
+        "action_matrix": (obs, 2), "bias": (obs,), "initial_mean": (state,),
+        "initial_root": (state, state), "weight0": (state, state + 2), "bias0": (state,),
+    }  # fmt: skip
+    return {
+        "leaves": {k: torch.empty(v, device=device) for k, v in shapes.items()},
+        "observed": torch.empty(2, 4, obs, dtype=torch.bool, device=device),
+        "reset": torch.empty(2, 4, dtype=torch.bool, device=device),
+        "use_stored": None, "layers": 1, "full_noise": False, "residual": True,
+        "activation": "tanh",
+    }  # fmt: skip
+
+
+@SIZES
+def test_a_tensor_class_of_its_own_and_autocast_change_nothing(obs):
+    class Own(torch.Tensor):
+        pass
+
+    problem = Problem(3, obs, dtype=torch.float32)
+    run, given = total(problem)
+    expected = run(*given)
+    found = run(*(x.as_subclass(Own) for x in given))
+    assert isinstance(found, Own)
+    assert_equal(found.as_subclass(torch.Tensor), expected, 1e-3)
+    model = problem.model()
+    for form in ("pytorch", "auto"):
+        plain = filter_sequence(model, *problem.arguments(), return_cov=True, form=form)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            cast = filter_sequence(model, *problem.arguments(), return_cov=True, form=form)
+        for a, b in zip(cast, plain, strict=True):
+            assert torch.equal(a, b)
