@@ -4,7 +4,7 @@ theory.md maps every equation of the paper to functions and tests: each function
 import, each test exists, and every equation that a docstring cites has a row that names the owner
 of that docstring. api.md lists the public names. Relative links lead somewhere. The guide's code is
 the script beside it, block for block, and the script runs by itself in another folder; so are the
-files of new_belief.md, which test_new_belief.py runs.
+files of extending.md, which test_extending.py runs.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ PACKAGE = ROOT / "torchrl_drbpn"
 PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 SCRIPT = DOCS / "guide" / "library_example.py"
 GUIDE = DOCS / "guide" / "belief_in_your_ppo.md"
-NEW_BELIEF = DOCS / "new_belief.md"
-EXAMPLE = DOCS / "new_belief"
+EXTENDING = DOCS / "extending.md"
+EXAMPLE = DOCS / "extending"
 EQUATIONS = {2, 3, 8, 10, 11, 12, 13}
 
 # "Eq. (8), (10), (12) [DRBPN]", "eq. 2, 3, 8 [DRBPN]", "(eq. 10 and 12 [DRBPN])"
@@ -233,10 +233,10 @@ def blocks_of(page: Path, language: str = "python") -> list[str]:
     ("blocks", "script"),
     [
         (blocks_of(GUIDE), SCRIPT),
-        (blocks_of(NEW_BELIEF)[:-1], EXAMPLE / "moving_average.py"),
-        (blocks_of(NEW_BELIEF)[-1:], EXAMPLE / "test_moving_average.py"),
+        (blocks_of(EXTENDING)[:1], EXAMPLE / "drift.py"),
+        (blocks_of(EXTENDING)[1:], EXAMPLE / "cautious.py"),
     ],
-    ids=["guide", "new belief", "its test"],
+    ids=["guide", "transform", "loss"],
 )
 def test_the_blocks_of_a_page_are_the_script_and_all_of_it(blocks, script):
     rest = script.read_text(encoding="utf-8")
@@ -252,7 +252,7 @@ def test_the_blocks_of_a_page_are_the_script_and_all_of_it(blocks, script):
 
 
 def test_the_entry_that_the_page_shows_is_the_file():
-    (block,) = blocks_of(NEW_BELIEF, "yaml")
+    (block,) = blocks_of(EXTENDING, "yaml")
     assert block == (EXAMPLE / "conf/belief/moving_average.yaml").read_text(encoding="utf-8")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from beliefs import Belief
+from beliefs import OBSERVATION, Belief
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torchrl.data import Unbounded
@@ -33,7 +33,7 @@ class MovingAverage(TensorDictModuleBase):
             )
         self.raw_decay = torch.nn.Parameter(torch.full((obs_dim,), init_decay).logit())
         self.prior = prior
-        self.in_keys = ["observation", "observed", "is_init", SUM, WEIGHT]
+        self.in_keys = [OBSERVATION, "observed", "is_init", SUM, WEIGHT]
         self.out_keys = ["features", ("next", *SUM), ("next", *WEIGHT)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
@@ -44,7 +44,7 @@ class MovingAverage(TensorDictModuleBase):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write features and memory: one step, or the last batch dimension as time."""
-        keys = ("observation", "observed", "is_init", SUM, WEIGHT)
+        keys = (OBSERVATION, "observed", "is_init", SUM, WEIGHT)
         x, observed, is_init, total, weight = (tensordict.get(key) for key in keys)
         decay = self.raw_decay.sigmoid()
         seen = observed.to(x.dtype)
@@ -75,11 +75,9 @@ class MovingAverage(TensorDictModuleBase):
         return kept * total + reading, kept * weight + seen
 
 
-def build(
-    *, obs_dim: int, action_dim: int, normalize: str, init_decay: float, prior: float
-) -> Belief:
+def build(*, obs_dim: int, action_dim: int, init_decay: float, prior: float) -> Belief:
     """Build the belief from the sizes of the task and its entry in conf/belief."""
-    del action_dim, normalize  # it reads no action and has no likelihood to divide
+    del action_dim  # it reads no action
     module = MovingAverage(obs_dim, init_decay=init_decay, prior=prior)
 
     def summary() -> dict[str, float]:

@@ -9,4 +9,4 @@ class TestMovingAverage(RecipeBeliefContract):
 
     def make_belief(self, obs: int = OBS, action: int = ACTION):
         """Return a belief, equal to every other made with the same arguments."""
-        return build(obs_dim=obs, action_dim=action, normalize="entry", init_decay=0.7, prior=0.1)
+        return build(obs_dim=obs, action_dim=action, init_decay=0.7, prior=0.1)

@@ -1,0 +1,59 @@
+"""docs/extending.md: a transform, a belief and a loss of one's own, from files elsewhere.
+
+Each command of the page trains, from any directory and by the command line alone. The duties of
+every belief module hold for the page's example.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hydra")
+from recipe_tools import ROOT, read_table  # isort: skip
+
+EXAMPLE = ROOT / "docs" / "extending"
+sys.path.insert(0, str(EXAMPLE))
+
+from test_moving_average import TestMovingAverage  # noqa: E402, F401  (collected here)
+
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^PYTHONPATH=.* recipes/ppo_drbpn\.py .*$", PAGE, re.MULTILINE)
+
+
+@pytest.mark.parametrize("line", COMMANDS, ids=["transform", "belief", "loss"])
+def test_a_command_of_the_page_trains_from_anywhere(line: str, tmp_path: Path) -> None:
+    from evaluation.trained import load_trained_agent
+
+    path, python, *words = shlex.split(line)
+    assert python == "python"
+    words = [str(ROOT / word) if (ROOT / word).exists() else word for word in words]
+    kept = os.environ.get("PYTHONPATH", "")
+    done = subprocess.run(
+        [sys.executable, *words, "experiment=smoke", "total_frames=128", "hydra.run.dir=run"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": f"{ROOT / path.partition('=')[2]}:{kept}"},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (row,) = read_table(tmp_path / "run" / "metrics.csv")
+    trained = load_trained_agent(tmp_path / "run")
+    if "moving_average" in line:
+        assert 0.6 < float(row["decay"]) < 0.8
+        assert trained.settings.belief.name == "moving_average"
+    if "cautious" in line:
+        assert trained.settings.loss.kl_coeff == 2
+        assert list((tmp_path / "run" / "logs").rglob("*loss_kl*"))
+    env = trained.environments()(0)
+    names = [type(t).__name__ for t in env.transform]
+    assert ("Drift" in names) == ("drift" in line)
+    assert trained.agent.policy(env.reset())["action"].isfinite().all()
