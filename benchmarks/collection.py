@@ -85,7 +85,7 @@ def main() -> None:
         sizes = (f"collector.num_envs={n}", f"collector.steps_per_env={steps}")
         parts = [recipe(f"env={args.env}", *sizes, "optim.minibatches=1") for _ in range(2)]
         (trained, settings), (drawn, _) = parts
-        env_id = settings.env.env_id
+        env_id = f"{settings.env.id}-{settings.env.version}"
         plain = [GymnasiumBatchEnv(env_id, n, seed=0) for _ in range(2)]
         actions = [plain[0].action_spec.rand().double().numpy() for _ in range(steps)]
         kwargs = {"autoreset_mode": AutoresetMode.SAME_STEP}

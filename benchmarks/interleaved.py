@@ -125,15 +125,10 @@ def recipe(*overrides: str) -> tuple[Any, Any]:
         overrides: as on the command line of ``recipes/ppo_drbpn.py``.
 
     Returns:
-        The run's parts and its settings.
+        The run's parts and its configuration.
     """
-    from hydra import compose, initialize_config_dir
-    from omegaconf import OmegaConf
-    from training.config import read_settings
-    from training.loop import assemble
+    from ppo_drbpn import assemble
+    from training.config import composed_config
 
-    OmegaConf.register_new_resolver("run_folder", lambda resume, new: resume or new, replace=True)
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
-    settings = read_settings(config)  # type: ignore[arg-type]
-    return assemble(settings), settings
+    config = composed_config(overrides)
+    return assemble(config), config

@@ -126,7 +126,8 @@ def main() -> None:
     cases |= {f"belief={name}": [f"belief={name}"] for name in args.beliefs}
     ours = {name: recipe(*extra, *common) for name, extra in cases.items()}
     training, settings = ours[DEFAULTS]
-    env_id, frames, epochs = settings.env.env_id, settings.collector.frames, settings.optim.epochs
+    env_id, epochs = f"{settings.env.id}-{settings.env.version}", settings.optim.epochs
+    frames = settings.collector.num_envs * settings.collector.steps_per_env
     candidates: dict[str, Callable[[], Any]] = {n: train(*parts) for n, parts in ours.items()}
     for name, package in ((SB3, "stable_baselines3"), (RECURRENT, "sb3_contrib")):
         if importlib.util.find_spec(package) is None:
@@ -152,7 +153,7 @@ def main() -> None:
 
 def train(training: Any, settings: Any) -> Callable[[], object]:
     """Make the call that collects one rollout and learns from it."""
-    from training.loop import train_rollout
+    from ppo_drbpn import train_rollout
 
     return lambda: train_rollout(training, settings)
 

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from interleaved import measure, recipe, show, start
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
@@ -32,10 +33,11 @@ POLICY, WHOLE = "TensorDict policy", "whole step"
 
 def update_parts(training: Any, settings: Any) -> tuple[dict[str, Callable[[], Any]], Any]:
     """Make the calls of one update, each with all that comes before it, and its minibatch."""
-    from training.rollout import add_advantages, minibatches, to_sequences
+    from ppo_drbpn import collect
+    from training.ppo import add_advantages, minibatches, to_sequences
 
     loss, belief = training.algorithm.loss, training.agent.belief
-    data = training.collector.rollout()
+    data = collect(training)
     add_advantages(data, training.agent, training.gae)
     sequences = to_sequences(data, loss, settings.optim.sequence_length)
     generator = torch.Generator().manual_seed(0)
@@ -81,11 +83,12 @@ def decisions(training: Any, rows: int, folder: Path | None) -> dict[str, Callab
         path = str(folder / f"policy_{rows}.pt2")
         package = torch._inductor.aoti_compile_and_package(exported, package_path=path)
         plain["AOTInductor"] = torch._inductor.aoti_load_package(package)
-    expected = agent.policy(source.copy()).get("action")
+    policy = TensorDictSequential(agent.belief, agent.actor)  # of normalised observations
+    expected = policy(source.copy()).get("action")
     for call in plain.values():
         torch.testing.assert_close(call(*inputs)[0], expected, rtol=1e-4, atol=1e-5)
     calls = {name: lambda call=call: call(*inputs) for name, call in plain.items()}
-    return {POLICY: lambda: agent.policy(source.copy())} | calls
+    return {POLICY: lambda: policy(source.copy())} | calls
 
 
 def main() -> None:

@@ -17,11 +17,11 @@ OBS, ACTION, TIME = 5, 2, 7
 
 
 def make_belief(name: str):
-    from beliefs import build_belief
+    from training.config import build
 
     config = recipe_tools.make_config(*f"belief={name}".split())
     torch.manual_seed(0)
-    return build_belief(config["belief"], obs_dim=OBS, action_dim=ACTION, normalize="entry")
+    return build("belief", config.belief, obs_dim=OBS, action_dim=ACTION)
 
 
 def make_frames(batch: int, seed: int = 0) -> TensorDict:
@@ -32,7 +32,9 @@ def make_frames(batch: int, seed: int = 0) -> TensorDict:
     is_init[0, 3] = True
     return TensorDict(
         {
-            "observation": torch.where(observed, torch.randn(batch, TIME, OBS, generator=g), 0.0),
+            "normalized_observation": torch.where(
+                observed, torch.randn(batch, TIME, OBS, generator=g), 0.0
+            ),
             "observed": observed,
             "previous_action": torch.randn(batch, TIME, ACTION, generator=g),
             "is_init": is_init,
@@ -45,9 +47,9 @@ def test_the_likelihood_is_that_of_the_entries_that_arrived():
     module = make_belief("gru").module
     frames = make_frames(3)
     frames["observed"][:] = False
-    frames["observation"][:] = float("nan")
+    frames["normalized_observation"][:] = float("nan")
     frames["observed"][1, 2, 4] = True
-    frames["observation"][1, 2, 4] = 0.7
+    frames["normalized_observation"][1, 2, 4] = 0.7
     value = module.foresight(torch.zeros(3, TIME, 64), frames)
     expected = torch.zeros(3, TIME)
     ahead = module.foresight.mean(torch.cat([torch.zeros(64), frames["previous_action"][1, 2]]))
@@ -75,13 +77,13 @@ def test_a_wrong_cell_is_named():
 
 
 def test_filling_holds_the_last_normalised_value_and_the_mean_before_the_first():
-    from training.config import read_settings
-    from training.loop import assemble
-
     with torch.random.fork_rng():
-        config = recipe_tools.make_config("experiment=smoke", "belief=fill", "missingness=mcar")
-        data = assemble(read_settings(config)).collector.rollout()
-    seen, value, start = data["observed"], data["observation"], data["is_init"]
+        words = ("experiment=smoke", "belief=fill", "missingness=mcar")
+        training, _ = recipe_tools.assembled(*words)
+        training.agent.norm.update(training.collector.rollout())
+        training.start_episodes()
+        data = training.collector.rollout()
+    seen, value, start = data["observed"], data["normalized_observation"], data["is_init"]
     held = torch.zeros_like(value[:, 0])  # 0 is the running mean, which raw 0 may be far from
     never = 0
     for t in range(data.shape[1]):

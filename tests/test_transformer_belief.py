@@ -20,13 +20,13 @@ MEMORY, LENGTH = ("recurrent", "memory"), ("recurrent", "length")
 
 def make_module(**sizes: int):
     """Return a transformer in float64."""
-    from beliefs import build_belief
+    from training.config import build
 
-    settings = recipe_tools.make_config("belief=transformer")["belief"]
+    settings = {**recipe_tools.make_config("belief=transformer").belief}
     settings |= {"window": 4, "width": 16, "layers": 1, **sizes}
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        belief = build_belief(settings, obs_dim=OBS, action_dim=ACTION, normalize="entry")
+        belief = build("belief", settings, obs_dim=OBS, action_dim=ACTION)
     return belief.module.double()
 
 
@@ -35,7 +35,9 @@ def make_frames(batch: int, time: int) -> TensorDict:
     g = torch.Generator().manual_seed(0)
     return TensorDict(
         {
-            "observation": torch.randn(batch, time, OBS, generator=g, dtype=torch.float64),
+            "normalized_observation": torch.randn(
+                batch, time, OBS, generator=g, dtype=torch.float64
+            ),
             "observed": torch.rand(batch, time, OBS, generator=g) < 0.6,
             "previous_action": torch.randn(batch, time, ACTION, generator=g, dtype=torch.float64),
             "is_init": torch.zeros(batch, time, 1, dtype=torch.bool),
@@ -47,7 +49,7 @@ def make_frames(batch: int, time: int) -> TensorDict:
 def reach(module, frames: TensorDict) -> Tensor:
     """Return whether the features of a step (row) move with what arrived at another (column)."""
     frames = frames.clone()
-    observation = frames["observation"].requires_grad_()
+    observation = frames["normalized_observation"].requires_grad_()
     with set_recurrent_mode(True):
         features = module(frames)["features"]
     weights = torch.linspace(1, 2, features.shape[-1], dtype=torch.float64)
@@ -135,7 +137,7 @@ def test_the_window_is_the_same_one_step_at_a_time():
     expected = in_steps(module, frames)["features"]
     for changed in range(9):
         other = frames.clone()
-        other["observation"][:, changed] += 1.0
+        other["normalized_observation"][:, changed] += 1.0
         moved = (in_steps(module, other)["features"] != expected).any(-1)[0]
         assert torch.equal(moved, band(9, 3)[:, changed])
 
@@ -239,10 +241,12 @@ def test_it_learns_to_repeat_what_arrived_some_steps_ago():
     losses = []
     for _ in range(250):
         frames = make_frames(16, 12)
-        frames["observation"] = torch.randn(16, 12, OBS, generator=g, dtype=torch.float64)
+        frames["normalized_observation"] = torch.randn(
+            16, 12, OBS, generator=g, dtype=torch.float64
+        )
         with set_recurrent_mode(True):
             out = head(module(frames)["features"]).squeeze(-1)
-        loss = (out[:, 4:] - frames["observation"][:, 1:-3, 0]).square().mean()
+        loss = (out[:, 4:] - frames["normalized_observation"][:, 1:-3, 0]).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
