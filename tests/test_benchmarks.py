@@ -22,7 +22,7 @@ sys.path.append(str(BENCHMARKS))
 
 import interleaved  # noqa: E402
 
-HELPERS = {"interleaved.py", "timing.py"}
+HELPERS = {"interleaved.py"}
 COMMANDS = sorted(p.name for p in BENCHMARKS.glob("*.py") if p.name not in HELPERS)
 
 
