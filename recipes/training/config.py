@@ -104,10 +104,9 @@ def build(name: str, node: Any, *args: Any, **kwargs: Any) -> Any:
         UserError: if there is no such target, or it refuses its arguments.
     """
     plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-    if isinstance(plain, dict):
-        plain.pop("name", None)
-        if "_target_" not in plain:
-            raise UserError(f"`{name}` must name what is built by `_target_`.")
+    if not isinstance(plain, dict) or "_target_" not in plain:
+        raise UserError(f"`{name}` must name what is built by `_target_`, got {plain!r}.")
+    plain.pop("name", None)
     try:
         return hydra.utils.instantiate(plain, *args, _convert_="all", **kwargs)
     except InstantiationException as error:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
@@ -69,7 +69,7 @@ def make_env(
 def _as_list(node: Any) -> list[Any]:
     if node is None:
         return []
-    return [node] if isinstance(node, (Mapping, DictConfig)) else list(node)
+    return list(node) if isinstance(node, (list, ListConfig)) else [node]
 
 
 def make_simulators(
