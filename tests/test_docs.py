@@ -187,11 +187,14 @@ def test_notation_names_the_keys_that_are_read_and_written():
     text = (DOCS / "notation.md").read_text(encoding="utf-8")
     keys = [*module.in_keys, *module.out_keys, *losses.BeliefModelLoss().out_keys]
     transforms = {  # required arguments, where there are some
+        "ObservationDelay": (1,),
         "ObservationMissingness": ("mcar", 0.5),
+        "ObservationMultiRate": (2,),
         "ObservationNoise": (0.1,),
         "ObservationSpikes": (0.1, 5.0),
         "SensorOutages": (0.5, 5),
         "SensorReduction": ([0],),
+        "StuckSensors": (0.1,),
     }
     room = importlib.import_module("torchrl_drbpn.transforms")
     for name in room.__all__:

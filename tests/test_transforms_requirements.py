@@ -29,13 +29,17 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_drbpn.transforms import (
     FillLastObserved,
+    ObservationDelay,
     ObservationMissingness,
+    ObservationMultiRate,
     ObservationNoise,
     ObservationSpikes,
     ObservedFromNaN,
     PreviousAction,
+    SensorDrift,
     SensorOutages,
     SensorReduction,
+    StuckSensors,
 )
 
 COMPLETE = "complete_observation"
@@ -89,6 +93,34 @@ def grouped(before: TensorDictBase, after: TensorDictBase) -> None:
     assert torch.equal(observed[..., [0, 1]], on[..., :1].expand(*on.shape[:-1], 2))
     assert torch.equal(observed[..., -1], on[..., 1])
     assert observed[..., 2:-1].all()
+
+
+def delayed(before: TensorDictBase, after: TensorDictBase) -> None:
+    observation, observed = after["observation"], after["observed"]
+    assert (observation[~observed] == 0).all()
+    assert after["delayed_observation"].shape == (*observation.shape[:-1], 2, observation.shape[-1])
+    # what is in no group is never late
+    assert torch.equal(observation[..., 2], after[COMPLETE][..., 2])
+    if "observation" in before:
+        assert torch.equal(after[COMPLETE], before["observation"])
+
+
+def stuck(before: TensorDictBase, after: TensorDictBase) -> None:
+    works = after["stuck_steps"] <= 0
+    assert "observed" not in after
+    assert torch.equal(after["observation"], after["stuck_observation"])
+    assert torch.equal(after["observation"][works], after[COMPLETE][works])
+    if "observation" in before:
+        assert torch.equal(after[COMPLETE], before["observation"])
+
+
+def drifting(before: TensorDictBase, after: TensorDictBase) -> None:
+    assert "observed" not in after
+    assert torch.equal(after["observation"], after[COMPLETE] + after["drift_bias"])
+    assert torch.equal(after["drift_bias"][..., [0, -1]] != 0, after["drift_steps"] > 0)
+    assert (after["drift_bias"][..., 1:-1] == 0).all()
+    if "observation" in before:
+        assert torch.equal(after[COMPLETE], before["observation"])
 
 
 def filled(before: TensorDictBase, after: TensorDictBase) -> None:
@@ -182,6 +214,47 @@ CASES = {
             complete_key=COMPLETE,
         ),
         grouped,
+    ),
+    "delay": Case(
+        partial(
+            ObservationDelay,
+            0,
+            max_delay=2,
+            groups=[[0, 1], [-1]],
+            seed=0,
+            complete_key=COMPLETE,
+        ),
+        delayed,
+        keys=("observation", "delayed_observation"),
+    ),
+    "multi_rate": Case(
+        partial(
+            ObservationMultiRate,
+            [1, 2, 3],
+            phase="random",
+            groups=[[0, 1], [2], [-1]],
+            seed=0,
+            complete_key=COMPLETE,
+        ),
+        masked,
+    ),
+    "stuck": Case(
+        partial(StuckSensors, 0.5, 3, seed=0, complete_key=COMPLETE),
+        stuck,
+        keys=("observation", "stuck_observation"),
+    ),
+    "drift": Case(
+        partial(
+            SensorDrift,
+            0.1,
+            0.5,
+            probability=0.5,
+            groups=[[0], [-1]],
+            seed=0,
+            complete_key=COMPLETE,
+        ),
+        drifting,
+        keys=("observation", "drift_bias"),
     ),
     "fill": Case(FillLastObserved, filled, needs=[mcar]),
     "previous_action": Case(PreviousAction, previous, keys=("previous_action",)),

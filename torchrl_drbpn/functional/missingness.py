@@ -272,6 +272,56 @@ def sample_working(
     return torch.where(working, uniform >= rates.failure, uniform < rates.repair)
 
 
+def sample_fault_steps(
+    steps: Tensor | None, rates: OutageRates, like: Tensor, generator: torch.Generator | None
+) -> Tensor:
+    """Draw how long every sensor's fault has lasted: the chain of `sample_working`, counted.
+
+    Args:
+        steps: int64, shape `(*batch, sensors)`, steps that the fault had lasted at the step before,
+            0 for a sensor that worked; None at the start, where all work.
+        rates: probabilities of a fault's begin and end at a step.
+        like: a tensor of shape `(*batch, sensors)`; only its shape and device are read.
+        generator: source of randomness; every sensor takes one number a step, none at the start.
+
+    Returns:
+        int64, shape `(*batch, sensors)`; 1 where a fault has begun.
+
+    Example:
+        >>> before = torch.tensor([0, 3, 0])
+        >>> sample_fault_steps(before, OutageRates(1.0, 0.0), before, None).tolist()
+        [1, 4, 1]
+    """
+    if steps is None:
+        return torch.zeros(like.shape, dtype=torch.int64, device=like.device)
+    working = sample_working(steps == 0, rates, like, generator)
+    return (steps + 1).masked_fill(working, 0)
+
+
+def sample_delay(
+    least: Tensor, most: Tensor, like: Tensor, generator: torch.Generator | None
+) -> Tensor:
+    """Draw by how many steps each reading is late, uniformly from `least` to `most`.
+
+    Args:
+        least: int64, shape `()` or `(sensors,)`, steps.
+        most: the same, not under `least`.
+        like: a tensor of shape `(*batch, sensors)`; only its shape and device are read.
+        generator: source of randomness; every sensor takes one number.
+
+    Returns:
+        int64, shape `(*batch, sensors)`.
+
+    Example:
+        >>> delay = sample_delay(torch.tensor(1), torch.tensor(3), torch.zeros(1000, 2), None)
+        >>> delay.unique().tolist()
+        [1, 2, 3]
+    """
+    uniform = torch.rand(like.shape, generator=generator, device=like.device)
+    # uniform < 1, but its product with a large span may round up to the span
+    return torch.minimum(least + (uniform * (most - least + 1)).long(), most)
+
+
 def sample_spikes(
     probability: Tensor | float,
     std: Tensor | float,

@@ -7,18 +7,24 @@ from torchrl_drbpn.transforms.missingness import (
     SensorReduction,
 )
 from torchrl_drbpn.transforms.noise import ObservationNoise, ObservationSpikes
+from torchrl_drbpn.transforms.observation_timing import ObservationDelay, ObservationMultiRate
 from torchrl_drbpn.transforms.outages import SensorOutages
 from torchrl_drbpn.transforms.previous_action import PreviousAction
 from torchrl_drbpn.transforms.seeding import seed_env
+from torchrl_drbpn.transforms.sensor_faults import SensorDrift, StuckSensors
 
 __all__ = [
     "FillLastObserved",
+    "ObservationDelay",
     "ObservationMissingness",
+    "ObservationMultiRate",
     "ObservationNoise",
     "ObservationSpikes",
     "ObservedFromNaN",
     "PreviousAction",
+    "SensorDrift",
     "SensorOutages",
     "SensorReduction",
+    "StuckSensors",
     "seed_env",
 ]

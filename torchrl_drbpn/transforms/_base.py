@@ -225,6 +225,8 @@ class CorruptingTransform(Transform):
 
     role: ClassVar[Role]
     writes_mask: ClassVar[bool] = True
+    # where what arrives is of an earlier step, the mask of this one must not be ANDed into it
+    ands_mask: ClassVar[bool] = True
     out_keys: list[NestedKey]
 
     def __init__(
@@ -277,7 +279,7 @@ class CorruptingTransform(Transform):
                 masks = [torch.ones_like(p, dtype=torch.bool) if m is None else m for p, m in pairs]
                 observed = _join(masks)
             corrupted, arrived = self._corrupt(Step(_join(parts), observed, before, tensordict))
-            if observed is not None:
+            if observed is not None and (arrived is None or self.ands_mask):
                 arrived = observed if arrived is None else arrived & observed
             if arrived is not None:
                 corrupted = zero_missing(corrupted, arrived)

@@ -15,15 +15,18 @@ from torchrl_drbpn.transforms._base import Keys, Role, Step, enter_new, mask_lik
 from torchrl_drbpn.transforms.seeding import SeededTransform
 
 
-class _Numbers:
-    """A number, or one number per component, from 0 to `most`, in the dtype of the data."""
+class PerComponent:
+    """A number, or one a component, from `least` to `most`, finite, in the dtype of the data."""
 
-    def __init__(self, value: object, name: str, meaning: str, most: float = math.inf) -> None:
+    def __init__(
+        self, value: object, name: str, meaning: str, most: float = math.inf, least: float = 0.0
+    ) -> None:
         try:
             read = torch.as_tensor(value, dtype=torch.float64).cpu()
         except (TypeError, ValueError, RuntimeError):
             read = torch.tensor(math.nan)
-        if read.ndim > 1 or not bool(((read >= 0) & (read <= most) & (read < math.inf)).all()):
+        inside = (read >= least) & (read <= most) & read.isfinite()
+        if read.ndim > 1 or not bool(inside.all()):
             raise ValueError(
                 f"`{name}` must be a number or one number per component, {meaning}, got {value!r}."
             )
@@ -32,6 +35,7 @@ class _Numbers:
         self._cast = self.value
 
     def check_obs_dim(self, obs_dim: int) -> None:
+        """Refuse numbers that are neither one nor as many as there are components."""
         if isinstance(self.value, Tensor) and self.value.shape[0] != obs_dim:
             raise ValueError(
                 f"`{self.name}` must have one entry per component, {obs_dim}, got "
@@ -39,6 +43,7 @@ class _Numbers:
             )
 
     def like(self, observation: Tensor) -> float | Tensor:
+        """Return the numbers on the device and in the dtype of `observation`."""
         self.check_obs_dim(observation.shape[-1])
         cast = self._cast
         if isinstance(cast, Tensor) and (cast.dtype, cast.device) != (
@@ -97,7 +102,7 @@ class ObservationNoise(SeededTransform):
         complete_key: Keys | None = None,
     ) -> None:
         super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
-        self._std = _Numbers(noise_std, "noise_std", _STD)
+        self._std = PerComponent(noise_std, "noise_std", STD)
 
     @property
     def noise_std(self) -> float | Tensor:
@@ -185,8 +190,8 @@ class ObservationSpikes(SeededTransform):
                 f"`spiked_key` must name keys of its own, got {self.spiked_keys} beside {taken}."
             )
         self.out_keys = [*self.out_keys, *self.spiked_keys]
-        self._probability = _Numbers(probability, "probability", "in [0, 1]", 1.0)
-        self._std = _Numbers(spike_std, "spike_std", _STD)
+        self._probability = PerComponent(probability, "probability", "in [0, 1]", 1.0)
+        self._std = PerComponent(spike_std, "spike_std", STD)
 
     @property
     def probability(self) -> float | Tensor:
@@ -221,4 +226,4 @@ class ObservationSpikes(SeededTransform):
         return spec
 
 
-_STD = "finite and not negative, in observation units"
+STD = "finite and not negative, in observation units"

@@ -1,0 +1,258 @@
+"""Readings that come late, in another order than they were taken, or only now and then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import StepCounter, TransformedEnv
+
+from torchrl_drbpn.functional.missingness import sample_delay
+from torchrl_drbpn.transforms._base import Keys, Role, Step, environment_of
+from torchrl_drbpn.transforms._carried import CarriedStateTransform, check_count, read_whole
+
+
+class ObservationDelay(CarriedStateTransform):
+    r"""Let every reading arrive some steps after it was taken.
+
+    A reading of step t arrives at step $t + d$, d = `delay`, or drawn for every reading uniformly
+    from `delay` to `max_delay`. A step at which nothing new arrives is masked; of several that
+    arrive at once the newest counts. With random delays a reading may arrive after one that was
+    taken later: it is shown, as a network that does not sort would do, or dropped with
+    `in_order=True`. What arrives counts as observed and is d steps old: nothing tells its age.
+
+    With a delay of d the first d steps of an episode show nothing. A reading that a mask hides was
+    never sent: the mask so far is delayed with its readings. What is on its way travels in the
+    tensordict under `state_keys`, so that partial resets and workers hold; it is max_delay
+    observations a step. A simulator that resets itself inside its step lets the last readings of
+    an episode arrive in the next one.
+
+    Args:
+        delay: steps, 0 or more; a number for all, or one for each group (each component, where
+            there are no groups).
+
+    Keyword Args:
+        max_delay: the most that a delay is drawn to, in the form of `delay`; None, the default:
+            `delay` is fixed.
+        in_order: drop readings that arrive after one that was taken later.
+        groups: lists of indices that travel together, in one packet (negative ones count from the
+            end), each index in one list at most; entries in none arrive at once. None, the default:
+            every entry by itself. Several observation keys count as one vector.
+        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
+            which gives the same delays to every worker and every transform built with it.
+        in_keys: observation keys, each of shape `(*batch, obs)`.
+        mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
+        complete_key: key (or one key per observation) under which the observation is recorded
+            before this transform; None, the default, records nothing.
+        state_keys: where what is on its way is kept, its values and its mask, each of shape
+            `(*batch, max_delay, obs)`; by default `delayed_observation` and `delayed_observed`
+            beside the first observation.
+
+    Raises:
+        ValueError: if a delay is no whole number or negative, `max_delay` is under `delay`, their
+            number is not that of the groups, an index of a group is out of range or in two; when
+            the environment is asked for its specs, also if its `StepCounter` ends episodes before
+            the first reading of a sensor can arrive. Other time limits can't be seen from here.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> late = ObservationDelay(1)
+        >>> first = late._reset(None, TensorDict({"observation": torch.tensor([1.0, 2.0])}))
+        >>> second = late._step(first, TensorDict({"observation": torch.tensor([3.0, 4.0])}))
+        >>> first["observed"].any().item(), second["observation"].tolist()
+        (False, [1.0, 2.0])
+
+    See also: `torchrl_drbpn.functional.sample_delay`.
+    """
+
+    role: ClassVar[Role] = "missingness"
+    ands_mask: ClassVar[bool] = False
+    stream: ClassVar[int] = 5
+    state_names: ClassVar[tuple[str, ...]] = ("delayed_observation", "delayed_observed")
+
+    def __init__(
+        self,
+        delay: int | Sequence[int] | Tensor,
+        *,
+        max_delay: int | Sequence[int] | Tensor | None = None,
+        in_order: bool = False,
+        groups: Sequence[Sequence[int]] | None = None,
+        seed: int | None = None,
+        in_keys: Keys = ("observation",),
+        mask_keys: Keys | None = None,
+        complete_key: Keys | None = None,
+        state_keys: Keys | None = None,
+    ) -> None:
+        super().__init__(
+            groups=groups,
+            state_keys=state_keys,
+            seed=seed,
+            in_keys=in_keys,
+            mask_keys=mask_keys,
+            complete_key=complete_key,
+        )
+        self.delay = read_whole(delay, "delay", 0)
+        self.max_delay = self.delay if max_delay is None else read_whole(max_delay, "max_delay", 0)
+        if self.delay.ndim and self.max_delay.ndim:
+            check_count(self.max_delay, "max_delay", len(self.delay))
+        if bool((self.max_delay < self.delay).any()):
+            raise ValueError(
+                f"`max_delay` must not be under `delay`, got {max_delay!r} and {delay!r}."
+            )
+        self.in_order = in_order
+        self._random = bool((self.max_delay > self.delay).any())
+        # one place at least: a dimension of none is nothing that shared memory can hold
+        self._places = max(1, int(self.max_delay.max()))
+
+    def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
+        return [((self._places, obs_dim), None), ((self._places, obs_dim), torch.bool)]
+
+    def _check_obs_dim(self, obs_dim: int) -> None:
+        super()._check_obs_dim(obs_dim)
+        check_count(self.delay, "delay", self._count(obs_dim))
+        check_count(self.max_delay, "max_delay", self._count(obs_dim))
+
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+        x, carried = step.observation, self._carried(step)
+        least, most = self.delay.to(x.device), self.max_delay.to(x.device)
+        delay = least
+        if self._random:
+            delay = sample_delay(least, most, self._group_like(x), self.generator(x.device))
+        delay = self._spread(delay, x, 0).unsqueeze(-2)
+        # place j holds the newest reading that arrives in j steps
+        if carried is None:
+            waiting = x.new_zeros(*x.shape[:-1], self._places + 1, x.shape[-1])
+            due = torch.zeros_like(waiting, dtype=torch.bool)
+        else:
+            waiting, due = (torch.cat([s, torch.zeros_like(s[..., :1, :])], -2) for s in carried)
+        place = torch.arange(self._places + 1, device=x.device).unsqueeze(-1)
+        sent = torch.ones_like(x, dtype=torch.bool) if step.observed is None else step.observed
+        sent = sent.unsqueeze(-2)
+        sent_there = (place == delay) & sent
+        waiting = torch.where(sent_there, x.unsqueeze(-2), waiting)
+        due = due | sent_there
+        if self.in_order:
+            due = due & ~((place > delay) & sent)
+        self._carry(step, waiting[..., 1:, :].contiguous(), due[..., 1:, :].contiguous())
+        return waiting[..., 0, :], due[..., 0, :].clone()
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Enter the observation, its mask, the states and, on request, what was complete."""
+        spec = super().transform_observation_spec(observation_spec)
+        env, longest = environment_of(self), int(self.delay.max())
+        while isinstance(env, TransformedEnv):
+            for part in env.transform.modules():
+                steps = part.max_steps if isinstance(part, StepCounter) else None
+                if steps is not None and longest >= steps:
+                    raise ValueError(
+                        f"`delay` must be shorter than an episode, got {longest} steps and "
+                        f"StepCounter(max_steps={steps}): nothing would arrive before its end."
+                    )
+            env = env.base_env
+        return spec
+
+
+class ObservationMultiRate(CarriedStateTransform):
+    r"""Let every sensor deliver at a rate of its own, as cameras, encoders and force sensors do.
+
+    A reading arrives at the steps $t = \text{phase}, \text{phase} + \text{period}, \dots$ of an
+    episode, t = 0 at the reset; between them the sensor is masked. Period 1 is every step.
+
+    How many steps are left until the next reading travels in the tensordict under `state_keys`, so
+    that partial resets and workers hold. A simulator that resets itself inside its step goes on
+    counting in the next episode.
+
+    Args:
+        period: steps from one reading to the next, 1 or more; a number for all, or one for each
+            group (each component, where there are no groups).
+
+    Keyword Args:
+        phase: step of the first reading, under the period, in the form of `period`; or "random", a
+            phase drawn for every group and episode.
+        groups: lists of indices of sensors that deliver together (negative ones count from the
+            end), each index in one list at most; entries in none arrive at every step. None, the
+            default: every entry by itself. Several observation keys count as one vector.
+        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
+            which gives the same phases to every worker and every transform built with it.
+        in_keys: observation keys, each of shape `(*batch, obs)`.
+        mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
+        complete_key: key (or one key per observation) under which the observation is recorded
+            before this transform; None, the default, records nothing.
+        state_keys: where the steps until the next reading are kept, int64 `(*batch, groups)`, 0
+            where one arrives; by default `steps_to_reading` beside the first observation.
+
+    Raises:
+        ValueError: if a period is no whole number or under 1, a phase is negative or not under its
+            period, their number is not that of the groups, or an index of a group is out of range
+            or in two.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> rates = ObservationMultiRate([1, 2], phase=[0, 1])
+        >>> data = rates._reset(None, TensorDict({"observation": torch.ones(2)}))
+        >>> data["observed"].tolist()
+        [True, False]
+        >>> rates._step(data, TensorDict({"observation": torch.ones(2)}))["observed"].tolist()
+        [True, True]
+    """
+
+    role: ClassVar[Role] = "missingness"
+    stream: ClassVar[int] = 6
+    state_names: ClassVar[tuple[str, ...]] = ("steps_to_reading",)
+
+    def __init__(
+        self,
+        period: int | Sequence[int] | Tensor,
+        *,
+        phase: int | Sequence[int] | Tensor | Literal["random"] = 0,
+        groups: Sequence[Sequence[int]] | None = None,
+        seed: int | None = None,
+        in_keys: Keys = ("observation",),
+        mask_keys: Keys | None = None,
+        complete_key: Keys | None = None,
+        state_keys: Keys | None = None,
+    ) -> None:
+        super().__init__(
+            groups=groups,
+            state_keys=state_keys,
+            seed=seed,
+            in_keys=in_keys,
+            mask_keys=mask_keys,
+            complete_key=complete_key,
+        )
+        self.period = read_whole(period, "period", 1)
+        random = isinstance(phase, str) and phase == "random"
+        self.phase = None if random else read_whole(phase, "phase", 0)
+        if self.phase is not None:
+            if self.period.ndim and self.phase.ndim:
+                check_count(self.phase, "phase", len(self.period))
+            if bool((self.phase >= self.period).any()):
+                raise ValueError(
+                    f"`phase` must be under the period, got {phase!r} and period {period!r}."
+                )
+
+    def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
+        return [((self._count(obs_dim),), torch.int64)]
+
+    def _check_obs_dim(self, obs_dim: int) -> None:
+        super()._check_obs_dim(obs_dim)
+        check_count(self.period, "period", self._count(obs_dim))
+        if self.phase is not None:
+            check_count(self.phase, "phase", self._count(obs_dim))
+
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+        x, carried = step.observation, self._carried(step)
+        like, last = self._group_like(x), self.period.to(x.device) - 1
+        if carried is not None:
+            left = torch.where(carried[0] == 0, last, carried[0] - 1)
+        elif self.phase is not None:
+            left = self.phase.to(x.device).expand(like.shape).clone()
+        else:
+            left = sample_delay(torch.zeros_like(last), last, like, self.generator(x.device))
+        self._carry(step, left)
+        return x, self._spread(left, x, 0) == 0
