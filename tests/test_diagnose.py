@@ -274,6 +274,7 @@ def test_an_observing_belief_acts_as_the_trained_one(
     with torch.no_grad():
         data = env.reset()
         for _ in range(4):
+            data = trained.agent.norm(data)
             plain, seeing = trained.agent.belief(data.clone()), observing(data.clone())
             for key in trained.agent.belief.out_keys:
                 torch.testing.assert_close(seeing[key], plain[key])
@@ -294,14 +295,14 @@ def test_a_forecast_gives_what_arrived_the_likelihood_that_the_belief_reports(
     with torch.no_grad():
         data = env.reset()
         for _ in range(4):
-            data = observing(data)
+            data = observing(trained.agent.norm(data))
             for row in range(2):
                 seen = data["observed"][row]
                 if seen.any():
                     mean = data[FORECAST][row][seen].double()
                     cov = data[FORECAST_COV][row][seen][:, seen].double()
                     density = torch.distributions.MultivariateNormal(mean, cov).log_prob(
-                        data["observation"][row][seen].double()
+                        data["normalized_observation"][row][seen].double()
                     )
                     reported = data["belief", "log_likelihood"][row].double()
                     torch.testing.assert_close(reported, density, rtol=1e-4, atol=1e-4)
