@@ -11,6 +11,7 @@ from torchrl_drbpn.functional import tril_to_vector, zero_missing
 from torchrl_drbpn.functional.robust import bounded
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
+from torchrl_drbpn.modules.state_space import GaussianTransition
 
 __all__ = ["PolicyStep"]
 
@@ -21,10 +22,9 @@ class PolicyStep(nn.Module):
     .. math::
         m_t = m^-_t + K_t (x_t - H m^-_t - B a_{t-1} - d), \qquad a_t = \mu(m_t)
 
-    The numbers of the policy's modules one step at a time, with the mean action, as a frozen copy:
-    later training does not reach it. What the parameters alone determine is computed once, here,
-    and kept in buffers. It has no TensorDict and no branch on
-    values, so ``torch.export.export`` takes it, with a dynamic batch too, and
+    A frozen copy of the policy's modules, one step at a time, with the mean action. What the
+    parameters alone determine is computed once, here, and kept in buffers. It has no TensorDict
+    and no branch on values, so ``torch.export.export`` takes it, with a dynamic batch too, and
     ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time.
 
     Args:
@@ -56,9 +56,6 @@ class PolicyStep(nn.Module):
     See also :class:`torchrl_drbpn.BeliefFilterModule`, the same with TensorDict keys.
     """
 
-    action_low: Tensor | None
-    action_high: Tensor | None
-
     def __init__(
         self,
         belief: BeliefFilterModule,
@@ -79,25 +76,23 @@ class PolicyStep(nn.Module):
         self.policy_input, self.gate = belief.policy_input, belief.gate
         self.norm, self.filter, self.head = copy.deepcopy((norm, belief.filter, head))
         self.requires_grad_(False)
-        for name, limit in (("action_low", action_low), ("action_high", action_high)):
-            self.register_buffer(name, None if limit is None else limit.detach().clone())
-        with torch.no_grad():
-            model = self.filter.state_space()
-        H, R, Q = model.emission_matrix.double(), model.emission_cov.double(), model.transition_cov
+        limits = [
+            x if x is None else nn.Buffer(x.detach().clone()) for x in (action_low, action_high)
+        ]
+        self.action_low, self.action_high = limits
+        model = self.filter.state_space()
         # float64, as in the belief module: what is factorised loses most digits in float32 where R
-        # is small. Of each pair the first serves within an episode, the second at its first step.
-        covs = [P.double() for P in (Q, model.initial_cov) if isinstance(P, Tensor)]
-        self.constant = len(covs) == 2
-        self.information = self.constant and R.ndim == 1 and H.shape[0] > H.shape[1]
-        P = torch.stack([P.diag() if P.ndim == 1 else P for P in (covs[0], covs[-1])])
-        S = H @ P @ H.mT + (R.diag() if R.ndim == 1 else R)
-        kept = {"matrix": H, "prior": P, "cross": H @ P, "innovation_cov": S}
-        kept |= {"noise": R.diag() if R.ndim == 1 else R, "eye": torch.eye(len(H)).to(H)}
+        # is small. Of a pair the first serves within an episode, the second at its first step.
+        H, R = model.emission_matrix.double().clone(), model.full_emission_cov().double()
+        P0, self.constant = model.full_initial_cov(), isinstance(model.transition_cov, Tensor)
+        self.information = self.constant and model.information_form
+        P = torch.stack([model.constant_cov() if self.constant else P0, P0]).double()
+        self.matrix, self.noise, self.prior = nn.Buffer(H), nn.Buffer(R), nn.Buffer(P)
+        self.cross, self.innovation_cov = nn.Buffer(H @ P), nn.Buffer(H @ P @ H.mT + R)
+        self.eye = nn.Buffer(torch.eye(len(H)).to(H))
         if self.information:
-            kept |= {"precision": torch.linalg.inv(P), "weight": 1 / R}
-            kept["outer"] = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
-        for name, value in kept.items():
-            self.register_buffer(name, value.detach().clone())
+            self.precision, self.weight = nn.Buffer(P.inverse()), nn.Buffer(1 / R.diagonal())
+            self.outer = nn.Buffer((H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2))
         self.eval()
 
     def initial_state(self, batch: int) -> tuple[Tensor, Tensor]:
@@ -153,50 +148,51 @@ class PolicyStep(nn.Module):
                     f"`{name}` must be {kind} of shape (*batch, {width}) with the batch of "
                     f"`observation` {tuple(batch)}, got {value.dtype} {tuple(value.shape)}."
                 )
-        seen = observed & observation.isfinite()
-        x = zero_missing(observation, seen)
-        x = (x if self.norm is None else self.norm.normalize(x, seen)).to(mean.dtype)
-        moved, cov = filter.transition(mean, previous_action)
+        seen = observed & (observation.abs() < torch.inf)  # False for NaN too
+        x = observation if self.norm is None else self.norm.normalize(observation, seen)
+        x, H, first, cov = x.to(mean.dtype), self.matrix, is_init.unsqueeze(-1), None
+        if self.constant and isinstance(filter.transition, GaussianTransition):
+            moved = filter.transition.mean_network()(mean, previous_action)
+        else:
+            moved, cov = filter.transition(mean, previous_action)
         m = torch.where(is_init, filter.initial_mean, moved)
-        expected = filter.emission(m, previous_action)
-        kept, wants_cov = self.get_buffer, self.policy_input == "mean_cov"
-        H = kept("matrix")
-        if not self.constant:
-            P = torch.where(is_init.unsqueeze(-1), kept("prior")[1], cov.to(H.dtype))
+        expected, wants_cov = filter.emission(m, previous_action), self.policy_input == "mean_cov"
+        if cov is not None:
+            P = torch.where(first, self.prior[1], cov.to(H.dtype))
             cross = H @ P
-            S = cross @ H.mT + kept("noise")
+            S = cross @ H.mT + self.noise
         elif not self.information or self.gate is not None:
-            cross, S = self._pair("cross", is_init), self._pair("innovation_cov", is_init)
+            cross, S = _row(self.cross, first), _row(self.innovation_cov, first)
         if self.gate is not None:
             deviation = S.diagonal(dim1=-2, dim2=-1).sqrt().to(x.dtype)
             x = bounded(x, seen, expected, deviation, self.gate)
         residual = zero_missing(x - expected, seen).to(H.dtype).unsqueeze(-1)
         # cholesky_ex: its plain form looks at a value on the host to raise.
         if self.information:
-            weight = seen * kept("weight")
-            precision = (weight @ kept("outer")).view(*weight.shape[:-1], *kept("prior").shape[1:])
-            factor, _ = torch.linalg.cholesky_ex(precision + self._pair("precision", is_init))
+            weight = seen * self.weight
+            precision = (weight @ self.outer).view(*weight.shape[:-1], *self.prior.shape[1:])
+            factor, _ = torch.linalg.cholesky_ex(precision + _row(self.precision, first))
             step = torch.cholesky_solve(H.mT @ (weight.unsqueeze(-1) * residual), factor)
-            cov = torch.cholesky_inverse(factor) if wants_cov else cov
+            cov = torch.cholesky_inverse(factor) if wants_cov else None
         else:
             both = seen.unsqueeze(-1) & seen.unsqueeze(-2)
-            factor, _ = torch.linalg.cholesky_ex(torch.where(both, S, kept("eye")))
+            factor, _ = torch.linalg.cholesky_ex(torch.where(both, S, self.eye))
             step = cross.mT @ torch.cholesky_solve(residual, factor)
             if wants_cov:
-                P = self._pair("prior", is_init) if self.constant else P
+                P = _row(self.prior, first) if cov is None else P
                 cross = zero_missing(cross, seen.unsqueeze(-1))
                 cov = P - cross.mT @ torch.cholesky_solve(cross, factor)
         features = filtered = m + step.squeeze(-1).to(m.dtype)
-        if wants_cov:
+        if wants_cov and cov is not None:
             features = torch.cat([filtered, tril_to_vector(cov).to(m.dtype)], -1)
         out = self.head(features)
         chosen = action = out[0] if isinstance(out, tuple) else out
         if self.action_low is not None and self.action_high is not None:
             action = torch.clamp(chosen, self.action_low, self.action_high)
-        rejected = (observed & ~seen).sum(-1, keepdim=True)
+        rejected = (observed ^ seen).sum(-1, keepdim=True)
         return action, filtered, torch.where(is_init, 0, age) + 1, chosen, rejected
 
-    def _pair(self, name: str, is_init: Tensor) -> Tensor:
-        """Choose between what serves within an episode and at its first step, row by row."""
-        within, first = self.get_buffer(name)
-        return torch.where(is_init.unsqueeze(-1), first, within)
+
+def _row(pair: Tensor, first: Tensor) -> Tensor:
+    """Choose what serves at the first step of an episode, or within it, row by row."""
+    return torch.where(first, pair[1], pair[0])
