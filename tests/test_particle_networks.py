@@ -16,11 +16,8 @@ from torch.distributions import Normal
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_drbpn import ParticleFilter, ParticleFilterModule
-from torchrl_drbpn.functional import (
-    ParticleNoise,
-    ParticleOutput,
-    systematic_ancestors,
-)
+from torchrl_drbpn.functional import ParticleNoise, ParticleOutput, systematic_ancestors
+from torchrl_drbpn.modules import particle_model
 
 
 # -------------------------------------------------------------------------- laws of the networks
@@ -151,17 +148,14 @@ def test_variances_never_fall_under_their_floor():
     with torch.no_grad():
         for head in (filter.emission_head, filter.proposal_head, filter.transition_head):
             head.bias[head.out_features // 2 :] = -1e3
-    networks = filter._networks()
-    data = make_frames((2,))
-    seen = filter.encoder(torch.cat([data["observation"], data["observed"].double()], -1))
-    action = filter.action_encoder(data["previous_action"])
-    inputs = networks.share(torch.cat([seen, action], -1), action)
+    shared = (torch.randn(2, 5).double(), torch.randn(2, 3).double())
+    networks = particle_model._Networks(filter)
     hidden = torch.zeros(2, K, HIDDEN, dtype=torch.float64)
-    prospect = networks.propose(hidden, inputs)
-    outcome = networks.step(prospect.proposal.mean, hidden, prospect.context, inputs)
+    proposed = networks.propose(hidden, shared)
+    outcome = networks.step(proposed.proposal.mean, hidden, shared)
     for gaussian, floor in (
-        (prospect.proposal, 0.1),
-        (prospect.transition, 0.1),
+        (proposed.proposal, 0.1),
+        (proposed.transition, 0.1),
         (outcome.emission, 0.5),
     ):
         torch.testing.assert_close(gaussian.variance, torch.full_like(gaussian.mean, floor**2))

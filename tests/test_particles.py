@@ -7,8 +7,6 @@ its log converges to it.
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from particle_tools import sample_noise
@@ -109,9 +107,8 @@ class LinearGaussian:
             DiagonalGaussian(mean + gain * (x - self.c * mean), variance), transition
         )
 
-    def step(
-        self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
-    ) -> ParticleStep:
+    def step(self, latent: Tensor, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ParticleStep:
+        del hidden, inputs
         emission = DiagonalGaussian(self.c * latent, self.R.expand_as(latent))
         return ParticleStep(emission, latent, latent)
 

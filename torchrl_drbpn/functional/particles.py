@@ -2,17 +2,15 @@
 
 The filter of deep variational reinforcement learning ([DVRL 2018]: Igl, Zintgraf, Le, Wood and
 Whiteson, *Deep Variational Reinforcement Learning for POMDPs*, ICML 2018). A particle is a
-deterministic memory h and a stochastic latent z. Everything is computed for all particles and all
-rows at once; the only loop is over time. Nothing here draws a random number: the noise of a step
-is an argument, so that the same noise gives the same particles again.
-
-Inside a docstring k counts particles, K is their number, q the proposal, p the model.
+deterministic memory h and a stochastic latent z. Only time is a loop. No random number is drawn
+here: the noise of a step is an argument, so that the same noise gives the same particles. In
+docstrings k counts particles, K is their number, q the proposal, p the model.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -49,7 +47,7 @@ class DiagonalGaussian(NamedTuple):
 
 
 class ParticleNoise(NamedTuple):
-    """Hold what is random in a step: given it, the filter is a function of its inputs.
+    """Hold the random numbers of a step; given them the filter is deterministic.
 
     Args:
         proposal: standard normal, shape ``(*batch, [time,] particles, latent)``; z is the
@@ -63,27 +61,24 @@ class ParticleNoise(NamedTuple):
 
 
 class ProposalOutput(NamedTuple):
-    """Hold what a model says of z before it is drawn.
+    """Hold the distributions of z that a model offers.
 
     Args:
         proposal: q(z | h, x, a), each ``(*batch, particles, latent)``.
         transition: p(z | h, a), the same shapes.
-        context: anything else of the model that its ``step`` wants back.
     """
 
     proposal: DiagonalGaussian
     transition: DiagonalGaussian
-    context: Any = None
 
 
 class ParticleStep(NamedTuple):
-    """Hold what follows from a z.
+    """Hold what a model computes from z.
 
     Args:
         emission: p(x | h, z, a), each ``(*batch, particles, obs)``.
         hidden: the next h, shape ``(*batch, particles, hidden)``.
-        embedding: what else of a particle is handed on beside h, such as features of z, shape
-            ``(*batch, particles, embedding)``.
+        embedding: further features of a particle, shape ``(*batch, particles, embedding)``.
     """
 
     emission: DiagonalGaussian
@@ -92,18 +87,16 @@ class ParticleStep(NamedTuple):
 
 
 class ParticleModel(Protocol):
-    """State what a model has to offer: two functions of all particles of all rows at once.
+    """Declare what a model offers: two functions of all particles of all rows at once.
 
-    ``inputs`` is a tuple of tensors with a leading ``(*batch,)``: whatever the model makes of the
-    step's observation, mask and action, the same for every particle of a row.
+    ``inputs``, tensors with a leading ``(*batch,)``, hold what the model computes from a step's
+    observation, mask and action; the particles of a row share them.
     """
 
     def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:
         """Return q(z | h, x, a) and p(z | h, a)."""
 
-    def step(
-        self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
-    ) -> ParticleStep:
+    def step(self, latent: Tensor, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ParticleStep:
         """Return p(x | h, z, a) and the next h."""
 
 
@@ -139,7 +132,7 @@ def diagonal_log_density(
     With nothing observed the value is exactly 0.
 
     Args:
-        value: x, shape ``(*batch, dim)``; what stands at missing entries is ignored.
+        value: x, shape ``(*batch, dim)``; missing entries may hold anything.
         gaussian: mean and variance, shapes that broadcast with ``(*batch, dim)``.
         observed: bool m, True = arrived, broadcasts with ``(*batch, dim)``; None: all of them.
 
@@ -186,7 +179,7 @@ def log_mean_weight(log_weight: Tensor) -> Tensor:
 
 
 def effective_sample_size(log_weight: Tensor) -> Tensor:
-    r"""Tell how many equally weighted particles these are worth.
+    r"""Count the equally weighted particles that would estimate as well as these.
 
     .. math:: \mathrm{ESS} = 1 / \sum_k \bar w_k^2
 
@@ -211,8 +204,8 @@ def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
 
     .. math:: a_k = \min \{ j : \sum_{i \le j} \bar w_i > (k + u) / K \}, \qquad k = 0..K-1
 
-    Particle j has K w_j offspring in expectation and never one more or less than that, rounded;
-    equal weights keep every particle. No gradient flows through the choice, as in the original.
+    Particle j has K w_j offspring in expectation, and that rounded up or down in every draw; equal
+    weights keep every particle. No gradient flows through the choice, as in [DVRL 2018].
 
     Args:
         log_weight: shape ``(*batch, particles)``, nats; need not be normalised.
@@ -288,9 +281,9 @@ def particle_step(
     See also :func:`particle_sequence`, whose example has a model.
     """
     hidden = resample(hidden, systematic_ancestors(log_weight, noise.resampling))
-    proposal, transition, context = model.propose(hidden, inputs)
+    proposal, transition = model.propose(hidden, inputs)
     latent = proposal.mean + proposal.variance.sqrt() * noise.proposal
-    step = model.step(latent, hidden, context, inputs)
+    step = model.step(latent, hidden, inputs)
     # log p - log q: the constants cancel, and (z - mean_q)^2 / variance_q is the noise squared.
     surprise = (latent - transition.mean).square() / transition.variance
     ratio = noise.proposal.square() - surprise + (proposal.variance / transition.variance).log()
@@ -339,7 +332,7 @@ def particle_sequence(
         ...     def propose(self, hidden, inputs):
         ...         moved = DiagonalGaussian(hidden, torch.ones_like(hidden))
         ...         return ProposalOutput(moved, moved)
-        ...     def step(self, latent, hidden, context, inputs):
+        ...     def step(self, latent, hidden, inputs):
         ...         seen = DiagonalGaussian(latent, torch.ones_like(latent))
         ...         return ParticleStep(seen, latent, latent)
         >>> noise = ParticleNoise(torch.randn(2, 5, 8, 3), torch.rand(2, 5, 1))
@@ -352,23 +345,15 @@ def particle_sequence(
     """
     dim = observation.ndim - 2  # time
     steps = zip(
-        hidden.unbind(dim),
-        log_weight.unbind(dim),
-        begin.unsqueeze(-1).unbind(dim),
-        zip(*(part.unbind(dim) for part in inputs), strict=True)
-        if inputs
-        else [()] * observation.shape[dim],
-        observation.unbind(dim),
-        observed.unbind(dim),
-        noise.proposal.unbind(dim),
-        noise.resampling.unbind(dim),
+        *(x.unbind(dim) for x in (hidden, log_weight, begin.unsqueeze(-1), observation, observed)),
+        *(x.unbind(dim) for x in (*noise, *inputs)),
         strict=True,
     )
     outs: list[ParticleOutput] = []
-    for given, weight, begins, step_inputs, x, m, proposal, resampling in steps:
+    for given, weight, begins, x, m, proposal, resampling, *step_inputs in steps:
         if outs:
             given = torch.where(begins.unsqueeze(-1), given, outs[-1].hidden)
             weight = torch.where(begins, weight, outs[-1].log_weight)
         step_noise = ParticleNoise(proposal, resampling)
-        outs.append(particle_step(model, given, weight, step_inputs, x, m, step_noise))
+        outs.append(particle_step(model, given, weight, tuple(step_inputs), x, m, step_noise))
     return ParticleOutput(*(torch.stack(parts, dim) for parts in zip(*outs, strict=True)))

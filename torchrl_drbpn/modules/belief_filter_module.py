@@ -1,4 +1,4 @@
-"""The belief filter with TensorDict keys and the manners of TorchRL's GRUModule."""
+"""The belief filter with TensorDict keys, in the place of TorchRL's GRUModule."""
 
 from __future__ import annotations
 
@@ -18,11 +18,16 @@ from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 
 __all__ = ["BeliefFilterModule"]
 
+_DEFAULT = ("features", ("belief", "mean"), ("belief", "log_likelihood"))
+_OPTIONAL = tuple(
+    ("belief", name) for name in ("cov", "observation", "predicted_observation", "innovation_cov")
+)
+
 
 class BeliefFilterModule(RecurrentBeliefModule):
     r"""Read what arrived, write the belief: a :class:`BeliefFilter` with keys.
 
-    It stands where a ``GRUModule`` stands in a TorchRL pipeline: one step at a time by default,
+    It takes the place of a ``GRUModule`` in a TorchRL pipeline: one step at a time by default,
     whole trajectories (last batch dimension = time) under ``set_recurrent_mode(True)``, its
     primer found by ``get_primers_from_module``.
 
@@ -53,11 +58,11 @@ class BeliefFilterModule(RecurrentBeliefModule):
         policy_input: what ``features`` holds, for policy and value to read (eq. 11 [DRBPN]):
             "mean", or "mean_cov" (lower triangle of the filtered covariance behind the mean).
         default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
-        gate: for an agent that is trained and acts among readings that arrive and are wrong:
-            those further than about this many standard deviations from their prediction count as
-            if they lay at that distance (:func:`functional.saturate_innovation`), and
-            ``("belief", "log_likelihood")`` is that of what was counted. None, the default: every
-            reading is believed. One step at a time only; the attribute ``gate`` may be set later.
+        gate: for a trained agent whose sensors may give wrong readings: those further than about
+            this many standard deviations from their prediction are moved to that distance
+            (:func:`functional.saturate_innovation`), and ``("belief", "log_likelihood")`` is that
+            of the moved readings. None: no reading is moved. One step at a time only; the
+            attribute ``gate`` may be set later.
 
     Raises:
         TypeError: if keys are neither a list nor a dict.
@@ -100,21 +105,9 @@ class BeliefFilterModule(RecurrentBeliefModule):
         if policy_input not in ("mean", "mean_cov"):
             raise ValueError(f"`policy_input` must be 'mean' or 'mean_cov', got {policy_input!r}.")
         super().__init__(
-            filter,
-            {("recurrent", "mean"): (filter.state_dim,)},
-            ("features", ("belief", "mean"), ("belief", "log_likelihood")),
-            (
-                ("belief", "cov"),
-                ("belief", "observation"),
-                ("belief", "predicted_observation"),
-                ("belief", "innovation_cov"),
-            ),
-            in_key=in_key,
-            in_keys=in_keys,
-            out_key=out_key,
-            out_keys=out_keys,
-            default_recurrent_mode=default_recurrent_mode,
-        )
+            filter, {("recurrent", "mean"): (filter.state_dim,)}, _DEFAULT, _OPTIONAL,
+            in_key, in_keys, out_key, out_keys, default_recurrent_mode,
+        )  # fmt: skip
         self.policy_input, self.gate = policy_input, gate
 
     @dispatch
@@ -132,9 +125,9 @@ class BeliefFilterModule(RecurrentBeliefModule):
             out = self.filter.step(mean, None, *readings, return_cov=want_cov, gate=self.gate)
         elif self.gate is not None:
             raise ValueError(
-                f"`gate` is {self.gate:g}, and the mode is recurrent: a gate is for an agent that "
-                "is trained and works one step at a time. Train without one (gate = None) and set "
-                "it afterwards."
+                f"`gate` is {self.gate:g}, and the mode is recurrent: a gate is for a trained "
+                "agent and works one step at a time. Train without one (gate = None) and set it "
+                "afterwards."
             )
         else:
             # The sum of one step, or of none where there is no time at all.

@@ -1,4 +1,4 @@
-"""The particle filter with TensorDict keys and the manners of TorchRL's GRUModule."""
+"""The particle filter with TensorDict keys, in the place of TorchRL's GRUModule."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from torchrl_drbpn.modules.particle_model import ParticleFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 
 __all__ = ["ParticleFilterModule"]
+
+_DEFAULT = ("features", ("belief", "log_likelihood"))
+_OPTIONAL = tuple(("belief", n) for n in ("observation", "latent", "effective_sample_size"))
 
 
 class ParticleFilterModule(RecurrentBeliefModule):
@@ -29,19 +32,14 @@ class ParticleFilterModule(RecurrentBeliefModule):
         filter: the filter.
 
     Keyword Args:
-        in_key: the key of the observation, when every other keeps its name.
-        in_keys: the seven entries read, in the order ``observation, observed, previous_action,
-            is_init, ("recurrent", "particles"), ("recurrent", "log_weight"),
-            ("recurrent", "age")``: a list of the first four or of all seven, or a dict from these
-            names to yours. None in the place of ``observed``: everything arrives; of
-            ``previous_action``: zeros.
-        out_key: the key of the features, when every other keeps its name.
-        out_keys: the entries written, a list chosen from ``features``,
-            ``("belief", "log_likelihood")`` (the default) and, only where asked for,
-            ``("belief", "observation")`` (the emission's mean, averaged over the particles: every
-            sensor's estimate), ``("belief", "latent")`` (z of every particle),
-            ``("belief", "effective_sample_size")``; or a dict from these names to yours. The
-            recurrent state is always written, under ``("next", ...)``.
+        in_key: as in :class:`~torchrl_drbpn.BeliefFilterModule`, and so are those below.
+        in_keys: ``("recurrent", "particles"), ("recurrent", "log_weight")`` take the place of
+            ``("recurrent", "mean")``: a list has four or seven entries.
+        out_key: the key of the features.
+        out_keys: chosen from ``features``, ``("belief", "log_likelihood")`` (the default) and, only
+            where asked for, ``("belief", "observation")`` (the emission's mean, averaged over the
+            particles: every sensor's estimate), ``("belief", "latent")`` (z of every particle),
+            ``("belief", "effective_sample_size")``.
         default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
 
     Raises:
@@ -80,24 +78,14 @@ class ParticleFilterModule(RecurrentBeliefModule):
         default_recurrent_mode: bool | None = None,
     ) -> None:
         count = filter.num_particles
+        state = {
+            ("recurrent", "particles"): (count, filter.hidden_dim),
+            ("recurrent", "log_weight"): (count,),
+        }
         super().__init__(
-            filter,
-            {
-                ("recurrent", "particles"): (count, filter.hidden_dim),
-                ("recurrent", "log_weight"): (count,),
-            },
-            ("features", ("belief", "log_likelihood")),
-            (
-                ("belief", "observation"),
-                ("belief", "latent"),
-                ("belief", "effective_sample_size"),
-            ),
-            in_key=in_key,
-            in_keys=in_keys,
-            out_key=out_key,
-            out_keys=out_keys,
-            default_recurrent_mode=default_recurrent_mode,
-        )
+            filter, state, _DEFAULT, _OPTIONAL,
+            in_key, in_keys, out_key, out_keys, default_recurrent_mode,
+        )  # fmt: skip
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

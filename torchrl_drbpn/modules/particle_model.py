@@ -21,6 +21,7 @@ from torchrl_drbpn.functional import (
 )
 from torchrl_drbpn.functional.gaussian import check_observed
 from torchrl_drbpn.modules.belief_filter import BeliefDivergedError, refuse_readings
+from torchrl_drbpn.modules.state_space import check_dim
 
 __all__ = ["ParticleFilter"]
 
@@ -79,9 +80,6 @@ class ParticleFilter(nn.Module):
     See also :class:`torchrl_drbpn.ParticleFilterModule`, the same with TensorDict keys.
     """
 
-    noise_table: Tensor
-    noise_multipliers: Tensor
-
     def __init__(
         self,
         obs_dim: int,
@@ -100,18 +98,11 @@ class ParticleFilter(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        sizes = {
-            "obs_dim": obs_dim,
-            "action_dim": action_dim,
-            "num_particles": num_particles,
-            "hidden_dim": hidden_dim,
-            "latent_dim": latent_dim,
-            "action_width": action_width,
-            **{f"encoder_sizes[{i}]": size for i, size in enumerate(encoder_sizes)},
-        }
+        sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "num_particles": num_particles}
+        sizes |= {"hidden_dim": hidden_dim, "latent_dim": latent_dim, "action_width": action_width}
+        sizes |= {f"encoder_sizes[{i}]": size for i, size in enumerate(encoder_sizes)}
         for name, size in sizes.items():
-            if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-                raise ValueError(f"`{name}` must be an int of at least 1, got {size!r}.")
+            check_dim(name, size)
         if len(encoder_sizes) != 2:
             raise ValueError(f"`encoder_sizes` must be two sizes, got {list(encoder_sizes)}.")
         for name, value in (("min_std", min_std), ("latent_min_std", latent_min_std)):
@@ -127,7 +118,6 @@ class ParticleFilter(nn.Module):
         self.encoder = _layers([2 * obs_dim, first, last], given)
         self.action_encoder = _layers([action_dim, action_width], given)
         self.latent_encoder = _layers([latent_dim, hidden_dim], given)
-        # The columns of h come first: what the particles of a row share is multiplied once.
         self.proposal = nn.Linear(hidden_dim + last + action_width, hidden_dim, **given)
         self.proposal_head = nn.Linear(hidden_dim, 2 * latent_dim, **given)
         self.transition = nn.Linear(hidden_dim + action_width, hidden_dim, **given)
@@ -148,12 +138,11 @@ class ParticleFilter(nn.Module):
         generator = torch.Generator().manual_seed(noise_seed)
         window = num_particles * latent_dim
         table = torch.randn(_ENTRIES + window - 1, generator=generator, dtype=dtype)
-        multipliers = torch.randint(-(1 << 62), 1 << 62, (2 * obs_dim + action_dim + 1,),
-                                    generator=generator)  # fmt: skip
+        words = 2 * obs_dim + action_dim + 1
+        multipliers = torch.randint(-(1 << 62), 1 << 62, (words,), generator=generator)
         # They follow from the seed: no checkpoint has to hold them.
-        self.register_buffer("noise_table", table.to(device), persistent=False)
-        odd = (2 * multipliers + 1).to(device)
-        self.register_buffer("noise_multipliers", odd, persistent=False)
+        self.noise_table = nn.Buffer(table.to(device), persistent=False)
+        self.noise_multipliers = nn.Buffer((2 * multipliers + 1).to(device), persistent=False)
 
     def reset_parameters(self) -> None:
         """Start again: orthogonal weights and zero biases, as the authors' code has them."""
@@ -204,10 +193,8 @@ class ParticleFilter(nn.Module):
         zeroed = zero_missing(observation, observed)
         seen = self.encoder(torch.cat([zeroed, observed.to(zeroed.dtype)], -1))
         action = self.action_encoder(previous_action)
-        networks = self._networks()
-        inputs = networks.share(torch.cat([seen, action], -1), action)
         out = particle_sequence(
-            networks, hidden, log_weight, begin, inputs, zeroed, observed, noise
+            _Networks(self), hidden, log_weight, begin, (seen, action), zeroed, observed, noise
         )
         self._check_values(out.log_likelihood, observation, observed)
         return out
@@ -271,14 +258,14 @@ class ParticleFilter(nn.Module):
     def noise(
         self, previous_action: Tensor, observation: Tensor, observed: Tensor, age: Tensor
     ) -> ParticleNoise:
-        """Look up the noise of a step: pseudo-random, and the same whenever it is asked for.
+        """Look up the noise of a step: pseudo-random, and the same at every call.
 
         PPO compares the policy that collected a step with the policy that learns from it, so
-        both must see the same particles. What a step brings (observation, mask, action, age) and
-        the seed are hashed; the hash chooses a place in a fixed table of standard normal numbers
-        and the start of the resampling. So nothing has to be stored or carried along, a step has
-        one noise in the collector, in GAE and in the loss, and no generator's state belongs into
-        a checkpoint. Numbers are read in float32, so that casting data keeps its noise.
+        both must see the same particles. The inputs of a step (observation, mask, action, age) are
+        hashed; the hash chooses a place in a fixed table of standard normal numbers, drawn from
+        ``noise_seed``, and the start of the resampling. So a step has one noise in the collector,
+        in GAE and in the loss, nothing is stored, and no generator's state belongs into a
+        checkpoint. Numbers are read in float32, so that casting data keeps its noise.
 
         Args:
             previous_action: shape ``(*batch, action)``.
@@ -306,24 +293,6 @@ class ParticleFilter(nn.Module):
         shape = (*key.shape, self.num_particles, self.latent_dim)
         return ParticleNoise(proposal.reshape(shape), uniform.unsqueeze(-1))
 
-    # ------------------------------------------------------------------ inside
-    def _networks(self) -> _Networks:
-        """Sort the weights by what they multiply, so that each is one product a step."""
-        h, cell = self.hidden_dim, self.memory
-        proposal, transition = self.proposal, self.transition
-        emission = self.emission.weight
-        parts = [proposal.weight[:, :h], transition.weight[:, :h], emission[:, :h], cell.weight_hh]
-        return _Networks(
-            own=torch.cat(parts),
-            gate_bias=cell.bias_hh,
-            seen=torch.cat([proposal.weight[:, h:], cell.weight_ih[:, h:]]),
-            seen_bias=torch.cat([proposal.bias, cell.bias_ih]),
-            moved=torch.cat([transition.weight[:, h:], emission[:, 2 * h :]]),
-            moved_bias=torch.cat([transition.bias, self.emission.bias]),
-            drawn=torch.cat([emission[:, h : 2 * h], cell.weight_ih[:, :h]]),
-            parts=self,
-        )
-
     def _check_values(self, log_likelihood: Tensor, observation: Tensor, observed: Tensor) -> None:
         if not self.validate or torch.compiler.is_compiling() or log_likelihood.is_meta:
             return
@@ -331,58 +300,36 @@ class ParticleFilter(nn.Module):
             return
         refuse_readings(observation, observed)
         raise BeliefDivergedError(
-            "the particles are no longer finite although every observed entry is: the learned "
-            "model diverged. Lower the learning rate."
+            "the particles are not finite although every observed entry is: the learned model "
+            "diverged. Lower the learning rate."
         )
 
 
 class _Networks(NamedTuple):
-    """The model of one forward pass: weights joined by what they multiply."""
+    """The filter's networks as a :class:`~torchrl_drbpn.functional.ParticleModel`."""
 
-    own: Tensor
-    gate_bias: Tensor
-    seen: Tensor
-    seen_bias: Tensor
-    moved: Tensor
-    moved_bias: Tensor
-    drawn: Tensor
     parts: ParticleFilter
 
-    def share(self, seen: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        """Multiply what all particles of a row share, for all steps at once."""
-        from_seen = linear(seen, self.seen, self.seen_bias)
-        from_action = linear(action, self.moved, self.moved_bias)
-        return from_seen, from_action
-
     def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:
-        h, parts = self.parts.hidden_dim, self.parts
-        from_seen, from_action = (part.unsqueeze(-2) for part in inputs)
-        last = parts.emission.out_features
-        to_q, to_p, to_x, to_gates = torch.split(linear(hidden, self.own), [h, h, last, 3 * h], -1)
-        seen_q, seen_gates = torch.split(from_seen, [h, 3 * h], -1)
-        action_p, action_x = torch.split(from_action, [h, last], -1)
-        floor = parts.latent_min_std**2
-        proposal = _gaussian(parts.proposal_head((to_q + seen_q).relu()), floor)
-        transition = _gaussian(parts.transition_head((to_p + action_p).relu()), floor)
-        return ProposalOutput(proposal, transition, (to_x + action_x, to_gates, seen_gates))
+        parts, floor = self.parts, self.parts.latent_min_std**2
+        seen, action = _each(inputs, hidden)
+        q = parts.proposal(torch.cat([hidden, seen, action], -1)).relu()
+        p = parts.transition(torch.cat([hidden, action], -1)).relu()
+        proposal = _gaussian(parts.proposal_head(q), floor)
+        return ProposalOutput(proposal, _gaussian(parts.transition_head(p), floor))
 
-    def step(
-        self, latent: Tensor, hidden: Tensor, context: Any, inputs: tuple[Tensor, ...]
-    ) -> ParticleStep:
-        del inputs
-        parts, h = self.parts, self.parts.hidden_dim
-        to_x, own_gates, seen_gates = context
+    def step(self, latent: Tensor, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ParticleStep:
+        parts, (seen, action) = self.parts, _each(inputs, hidden)
         embedding = parts.latent_encoder(latent)
-        from_drawn = linear(embedding, self.drawn)
-        drawn_x, drawn_gates = torch.split(from_drawn, [to_x.shape[-1], 3 * h], -1)
-        decoded = parts.decoder((to_x + drawn_x).relu())
-        emission = _gaussian(parts.emission_head(decoded), parts.min_std**2)
-        # The GRU's equations, over sums of products that are already there.
-        outer = seen_gates + drawn_gates
-        inner = own_gates + self.gate_bias
-        reset, keep = (outer[..., : 2 * h] + inner[..., : 2 * h]).sigmoid().chunk(2, -1)
-        fresh = (outer[..., 2 * h :] + reset * inner[..., 2 * h :]).tanh()
-        return ParticleStep(emission, fresh + keep * (hidden - fresh), embedding)
+        x = parts.emission(torch.cat([hidden, embedding, action], -1)).relu()
+        emission = _gaussian(parts.emission_head(parts.decoder(x)), parts.min_std**2)
+        rows = torch.cat([embedding, seen, action], -1).flatten(0, -2), hidden.flatten(0, -2)
+        return ParticleStep(emission, parts.memory(*rows).view_as(hidden), embedding)
+
+
+def _each(inputs: tuple[Tensor, ...], hidden: Tensor) -> list[Tensor]:
+    """Give every particle what its row shares."""
+    return [x.unsqueeze(-2).expand(*hidden.shape[:-1], x.shape[-1]) for x in inputs]
 
 
 def _gaussian(raw: Tensor, floor: float) -> DiagonalGaussian:

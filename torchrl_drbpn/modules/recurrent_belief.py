@@ -1,8 +1,7 @@
-"""What belief modules share: keys, mode and state, with the manners of TorchRL's GRUModule."""
+"""What belief modules share with TorchRL's GRUModule: keys, mode, recurrent state, primer."""
 
 from __future__ import annotations
 
-import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ __all__ = ["Keys", "RecurrentBeliefModule"]
 Keys = Sequence[NestedKey | None] | Mapping[NestedKey, NestedKey | None] | None
 
 _AGE = ("recurrent", "age")
-# What is read beside the recurrent state, and who writes it.
+# What is read beside the recurrent state, and what to do if it is absent.
 _SOURCES = {
     "observation": "does the environment use another name? Pass in_keys",
     "observed": "ObservationMissingness or ObservedFromNaN writes it; in_keys={'observed': None} "
@@ -56,12 +55,10 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         state: the recurrent entries but the age, from name to shape.
         outputs: entries written by default, features first.
         optional: entries written where asked for.
-
-    Keyword Args:
-        in_key: the key of the observation, when every other keeps its name.
-        in_keys: see the subclass.
-        out_key: the key of the features, when every other keeps its name.
-        out_keys: see the subclass.
+        in_key: see :class:`~torchrl_drbpn.BeliefFilterModule`, as for those below.
+        in_keys: entries read.
+        out_key: where the features go.
+        out_keys: entries written.
         default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
 
     Example:
@@ -76,12 +73,11 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         state: Mapping[NestedKey, tuple[int, ...]],
         outputs: Sequence[NestedKey],
         optional: Sequence[NestedKey],
-        *,
-        in_key: NestedKey | None = None,
-        in_keys: Keys = None,
-        out_key: NestedKey | None = None,
-        out_keys: Keys = None,
-        default_recurrent_mode: bool | None = None,
+        in_key: NestedKey | None,
+        in_keys: Keys,
+        out_key: NestedKey | None,
+        out_keys: Keys,
+        default_recurrent_mode: bool | None,
     ) -> None:
         super().__init__()
         self.filter = filter
@@ -109,8 +105,9 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         self._state = {self._in[name]: shape for name, shape in {**state, _AGE: (1,)}.items()}
         self._next = [unravel_key(("next", key)) for key in self._state]
         if out_keys is None:
-            out_keys = {name: name for name in outputs}
-            out_keys[outputs[0]] = outputs[0] if out_key is None else out_key
+            out_keys = {name: name for name in outputs} | {
+                outputs[0]: outputs[0] if out_key is None else out_key
+            }
         elif not isinstance(out_keys, Mapping):
             listed = _as_keys("out_keys", out_keys)
             out_keys = {key: key for key in listed if key not in self._next}
@@ -122,7 +119,6 @@ class RecurrentBeliefModule(TensorDictModuleBase):
             if twice:
                 raise ValueError(f"`{name}` must give every entry a key of its own: {twice} twice.")
 
-    # ------------------------------------------------------------------ reading, writing
     def _read(self, tensordict: TensorDictBase) -> _Inputs:
         """Read the inputs and the state that each step starts from."""
         found: dict[str, Any] = {}
@@ -164,7 +160,7 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         if not sequence:  # is_init alone resets, as in GRUModule
             age = torch.where(first.unsqueeze(-1), 0, age)
             return _Inputs(*inputs, first, torch.zeros_like(first), state, age)
-        # An is_init with an older age is a seam of a stitched row: the state is stored there.
+        # An is_init with an older age is where two slices were joined: the state is stored there.
         reset = first & (age.squeeze(-1) == 0)
         return _Inputs(*inputs, reset, first & ~reset, state, age)
 
@@ -195,14 +191,10 @@ class RecurrentBeliefModule(TensorDictModuleBase):
     @property
     def dtype(self) -> torch.dtype:
         """Precision of the filter's parameters."""
-        # Value estimators swap detached tensors in, which are attributes and no parameters.
-        swapped = (
-            value
-            for module in self.filter.modules()
-            for value in vars(module).values()
-            if isinstance(value, Tensor)
-        )
-        return next(itertools.chain(self.filter.parameters(), swapped)).dtype
+        # By name: value estimators swap in detached tensors, which parameters() does not list.
+        filter = self.filter
+        like = filter.initial_mean if isinstance(filter, BeliefFilter) else filter.noise_table
+        return like.dtype
 
     @property
     def recurrent_mode(self) -> bool:
@@ -216,17 +208,7 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         return [*self.in_keys, *self.out_keys]
 
     def canonicalize(self, data: TensorDictBase, *, inplace: bool = False) -> TensorDictBase:
-        """Make this module's entries contiguous; others keep their memory.
-
-        Args:
-            data: entries; absent ones are passed over.
-
-        Keyword Args:
-            inplace: whether ``data`` itself is changed.
-
-        Returns:
-            The tensordict.
-        """
+        """Make this module's entries contiguous where they are there; others keep their memory."""
         part = data.select(*self.canonical_keys, strict=False).contiguous()
         return (data if inplace else data.copy()).update(part)
 
@@ -246,8 +228,8 @@ class RecurrentBeliefModule(TensorDictModuleBase):
             >>> ("recurrent", "mean") in primer.primers.keys(True)
             True
         """
-        # No device, as in TorchRL's own: an environment that has one moves the primer to it, one
-        # without (device=None) resets on the CPU, whatever the policy runs on.
+        # No device: an environment that has one moves the primer to it, one without resets on the
+        # CPU, whatever the policy runs on.
         specs = {key: Unbounded(shape, dtype=self.dtype) for key, shape in self._state.items()}
         specs[self._in[_AGE]] = Unbounded((1,), dtype=torch.int64)
         return TensorDictPrimer(specs, expand_specs=True)
@@ -269,10 +251,9 @@ def _as_keys(argument: str, given: Sequence[NestedKey | None]) -> list[NestedKey
 def _renamed(
     argument: str, given: Mapping[NestedKey, NestedKey | None], names: Sequence[NestedKey]
 ) -> dict[NestedKey, NestedKey | None]:
-    """Return the map from canonical names to the user's keys, or say which name is unknown."""
-    pairs = dict(
-        zip(_as_keys(argument, list(given)), _as_keys(argument, list(given.values())), strict=True)
-    )
+    """Return the map from canonical names to the user's keys; refuse unknown names."""
+    listed = (_as_keys(argument, list(part)) for part in (given, given.values()))
+    pairs = dict(zip(*listed, strict=True))
     unknown = [name for name in pairs if name not in names]
     if unknown:
         raise ValueError(
