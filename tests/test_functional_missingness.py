@@ -17,7 +17,6 @@ import pytest
 import torch
 
 from torchrl_drbpn.functional.missingness import (
-    count_always_observed,
     draw_mechanism,
     missing_probability,
     outage_rates,
@@ -52,7 +51,6 @@ def example(batch=(4,), seed=5):
 def test_the_number_of_always_observed_entries_is_the_rounded_share_and_at_least_one(
     obs, share, count
 ):
-    assert count_always_observed(obs, share) == count
     drawn = draw_mechanism("mar", obs, ACTION, always_observed=share, generator=seeded())
     assert int(drawn.always_observed.sum()) == count
 

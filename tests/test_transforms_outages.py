@@ -88,7 +88,7 @@ def test_a_mask_that_is_there_is_anded_and_the_chain_goes_on_beneath_it():
     mask[:, 2] = False
     before = data(1.0, observed=mask)
     before["observation"][:, 2] = math.nan
-    after = SensorOutages(0.3, 5)._call(before)
+    after = SensorOutages(0.3, 5, seed=0)._call(before)
     assert torch.equal(after["observed"], after["sensor_on"] & mask)
     assert torch.equal(after["observation"], after["observed"].float())
     assert after["sensor_on"][:, 2].any()
@@ -143,9 +143,6 @@ def test_a_state_that_got_lost_is_named_rather_than_drawn_anew():
     outages = SensorOutages(0.5, 5)
     root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
     with pytest.raises(KeyError, match=r"under 'sensor_on', which is not there\. Start from"):
-        outages._step(root, data())
-    root["sensor_on"] = torch.ones(4, 2, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"`sensor_on` must be bool of shape \(4, 5\)"):
         outages._step(root, data())
 
 

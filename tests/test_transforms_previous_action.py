@@ -121,7 +121,7 @@ def test_an_index_action_may_be_written_as_one_hot_and_is_zero_at_a_start(where)
     else:
         env = with_it(SerialEnv(2, simulator))
     check_env_specs(env)
-    data = env.rollout(40, break_when_any_done=False)
+    data = env.rollout(150, break_when_any_done=False)
     following = data["next", "previous_action"]
     assert torch.equal(following, torch.nn.functional.one_hot(data["action"], 2).float())
     assert (data["previous_action"][..., 0, :] == 0).all()

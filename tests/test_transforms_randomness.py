@@ -3,8 +3,8 @@
 Without a seed they follow torch's global generator, and no two workers draw the same. One seed
 gives one sequence, at resets as at steps; MAR and NMAR follow the functional law with the action
 that led to the observation, zero at the first step of an episode; the complete observation is that
-of the clean environment; a state carries the mechanism; `seed_env` reaches every generator, in
-workers too, and leaves the mechanism alone.
+of the clean environment; a mechanism is that of its own seed; `seed_env` reaches every generator,
+in workers too, and leaves the mechanism alone.
 """
 
 from __future__ import annotations
@@ -219,7 +219,8 @@ def test_data_on_a_gpu_stays_there_with_the_same_mechanism(mechanism, seed):
     assert first["observed"].is_cuda
     assert torch.equal(first["observation"] == 1, first["observed"])
     if mechanism != "mcar":
-        assert all(map(torch.equal, here.mechanism_parameters, there.mechanism_parameters))
+        on_gpu = [part.cpu() for part in there.mechanism_parameters]
+        assert all(map(torch.equal, here.mechanism_parameters, on_gpu))
 
 
 @pytest.mark.parametrize("mechanism", KINDS)
@@ -305,31 +306,6 @@ def test_with_a_seed_the_complete_observation_is_that_of_the_clean_environment()
 
 
 # -------------------------------------------------------------------------------------------- state
-def test_a_state_carries_the_mechanism_and_refuses_another_environment():
-    first = ObservationMissingness("nmar", 0.5, mechanism_seed=1)
-    staircase(first).rollout(3)
-    second = ObservationMissingness("nmar", 0.5, seed=9, mechanism_seed=1)
-    second.load_state_dict(saved(first.state_dict()))
-    assert all(map(torch.equal, first.mechanism_parameters, second.mechanism_parameters))
-    env = TransformedEnv(StaircaseEnv(obs=7), second)
-    with pytest.raises(ValueError, match=r"must have 5 components .* another environment"):
-        env.reset()
-
-
-def test_a_state_of_another_mechanism_is_passed_over_and_of_another_mechanism_seed_refused():
-    first = ObservationMissingness("mar", 0.5, seed=3)
-    staircase(first).rollout(3)
-    state = saved(first.state_dict())
-    for kind in ("mcar", "nmar"):
-        other = ObservationMissingness(kind, 0.5)
-        other.load_state_dict(state)
-        assert (other.seed, other.mechanism_parameters) == (3, None)
-    other = ObservationMissingness("mar", 0.5, mechanism_seed=9, seed=5)
-    with pytest.raises(ValueError, match="mechanism_seed 0, this transform has mechanism_seed 9"):
-        other.load_state_dict(state)
-    assert (other.seed, other.mechanism_parameters) == (5, None)
-
-
 def test_a_state_of_another_kind_of_device_starts_again_with_a_warning():
     first = ObservationMissingness("mcar", 0.5, seed=3)
     expected = first._call(data())["observed"]

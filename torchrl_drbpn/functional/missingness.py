@@ -37,22 +37,6 @@ class MissingnessMechanism(NamedTuple):
     action_weight: Tensor
 
 
-def count_always_observed(obs_dim: int, share: float) -> int:
-    """Return how many of `obs_dim` entries always arrive: round(share * obs_dim), at least 1.
-
-    Args:
-        obs_dim: number of entries.
-        share: share of them that always arrives, in [0, 1].
-
-    Returns:
-        The number; a tie goes to the even neighbour, as in Python's `round`.
-
-    >>> count_always_observed(17, 0.25), count_always_observed(2, 0.1)
-    (4, 1)
-    """
-    return max(1, round(share * obs_dim))
-
-
 def draw_mechanism(
     kind: Literal["mar", "nmar"],
     obs_dim: int,
@@ -63,8 +47,9 @@ def draw_mechanism(
 ) -> MissingnessMechanism:
     """Draw the always observed entries and b0, b1, b2 ~ N(0, 1) of a mechanism.
 
-    MAR and NMAR draw the same numbers from the same generator state, and the action's weights come
-    last, so that all else does not depend on the number of actions.
+    round(always_observed * obs_dim) entries always arrive, at least 1. MAR and NMAR draw the same
+    numbers from the same generator state, and the action's weights come last, so that all else
+    does not depend on the number of actions.
 
     Args:
         kind: "mar" or "nmar".
@@ -89,7 +74,7 @@ def draw_mechanism(
         raise ValueError(f'`kind` must be "mar" or "nmar", got {kind!r}; "mcar" has no parameters.')
     if not 0.0 <= always_observed <= 1.0:
         raise ValueError(f"`always_observed` must be a share in [0, 1], got {always_observed}.")
-    count = count_always_observed(obs_dim, always_observed)
+    count = max(1, round(always_observed * obs_dim))
     if count >= obs_dim:
         raise ValueError(
             f"`always_observed` must leave an entry that can go missing, got {always_observed} of "
@@ -161,8 +146,8 @@ def sample_mask(
         (True, False)
     """
     uniform = torch.rand(like.shape, generator=generator, device=like.device)
-    # uniform < 1, so that probability 1 always misses; and where the probability is NaN, from a NaN
-    # in the observation, the entry arrives: a mask must not hide that the simulation broke down
+    # uniform < 1, so that probability 1 always misses; where the probability is NaN, from a NaN in
+    # the observation, the entry arrives: a mask must not hide that the simulation broke down
     return (uniform < probability).logical_not_()
 
 

@@ -23,7 +23,7 @@ def as_key_list(keys: Keys) -> list[NestedKey]:
     """Return one key, or a list of keys, as a list; a tuple of strings is one nested key."""
     items: list[Any] = [keys] if isinstance(keys, str | tuple) else list(keys)
     for place, key in enumerate(items):
-        # configurations know no tuples: inside a list, a list of strings is a nested key as well
+        # YAML has no tuples: inside a list, a list of strings is a nested key as well
         flat = [key] if isinstance(key, str) or not isinstance(key, Sequence) else list(key)
         if not flat or not all(isinstance(part, str) for part in flat):
             raise TypeError(
@@ -35,8 +35,13 @@ def as_key_list(keys: Keys) -> list[NestedKey]:
 
 
 def sibling_key(key: NestedKey, name: str) -> NestedKey:
-    """Return the key called `name` that lies beside `key`."""
+    """Return the key called `name` beside `key`."""
     return (*key[:-1], name) if isinstance(key, tuple) else name
+
+
+def last_name(key: NestedKey) -> str:
+    """Return the name of an entry without the names of what it lies in."""
+    return str(key[-1]) if isinstance(key, tuple) else key
 
 
 def pair_keys(
@@ -52,30 +57,28 @@ def pair_keys(
     return pairs
 
 
-# ------------------------------------------------------------------------------------------- data
-def read(tensordict: TensorDictBase, key: NestedKey, owner: Transform) -> Tensor:
-    """Return the entry under `key`, or raise a KeyError that names the transform and the key."""
-    value: Tensor | None = tensordict.get(key, None)
-    if value is None:
+# --------------------------------------------------------------- checks, of specs and of data alike
+def read_leaf(source: Any, key: NestedKey, owner: Transform) -> Any:
+    """Return the tensor or spec under `key`, or raise a KeyError that names the transform."""
+    if key not in source.keys(True, True):
         raise KeyError(
-            f"`{type(owner).__name__}` reads {key!r}, which is not among the keys "
-            f"{sorted(map(str, tensordict.keys(True, True)))}. Pass the key that your environment "
-            "writes."
+            f"`{type(owner).__name__}` reads {key!r}, which is not among "
+            f"{sorted(map(str, source.keys(True, True)))}. Pass the key that the environment has."
         )
-    return value
+    return source[key]
 
 
-def check_vector(
-    given: Tensor | TensorSpec, key: NestedKey, owner: Transform, batch_dims: int | None = None
-) -> None:
-    """Refuse an observation that is not a vector of floats; with `batch_dims`, one a row."""
-    vector = given.ndim > 0 if batch_dims is None else given.ndim == batch_dims + 1
-    if not vector or not given.dtype.is_floating_point:
+def read_vector(source: Any, key: NestedKey, owner: Transform) -> Any:
+    """Return the observation, or its spec, under `key`: one vector of floats for each row."""
+    leaf = read_leaf(source, key, owner)
+    batch_dims = (source[key[:-1]] if isinstance(key, tuple) else source).ndim
+    if leaf.ndim != batch_dims + 1 or not leaf.dtype.is_floating_point:
         raise ValueError(
             f"`{key}` must be a vector of floating point numbers of shape (*batch, obs) for "
-            f"`{type(owner).__name__}`, got {given.dtype} of shape {tuple(given.shape)}. Flatten "
+            f"`{type(owner).__name__}`, got {leaf.dtype} of shape {tuple(leaf.shape)}. Flatten "
             "or cast it first, as with FlattenObservation, CatTensors or DTypeCastTransform."
         )
+    return leaf
 
 
 def check_mask(mask: Tensor | TensorSpec, observation: Tensor | TensorSpec, key: NestedKey) -> None:
@@ -88,30 +91,7 @@ def check_mask(mask: Tensor | TensorSpec, observation: Tensor | TensorSpec, key:
         )
 
 
-def flagged_rows(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> Tensor | None:
-    """Return the rows that `"_reset"`, beside `key` or above it, marks, spread over `value`."""
-    folders = key[:-1] if isinstance(key, tuple) else ()
-    for depth in range(len(folders), -1, -1):
-        flag = tensordict.get((*folders[:depth], "_reset"), None)
-        if flag is not None:
-            rows = flag.flatten(tensordict.ndim).any(-1) if flag.ndim > tensordict.ndim else flag
-            return rows.reshape(*rows.shape, *(1,) * (value.ndim - rows.ndim)).expand_as(value)
-    return None
-
-
 # ------------------------------------------------------------------------------------------ specs
-def observation_leaf(spec: Composite, key: NestedKey, owner: Transform) -> TensorSpec:
-    """Return the spec under `key`, shape `(*batch, obs)`, which must be a vector of floats."""
-    if key not in spec.keys(True, True):
-        raise KeyError(
-            f"`{type(owner).__name__}` reads {key!r}, which is not among the observations "
-            f"{sorted(map(str, spec.keys(True, True)))} of the environment. Pass in_keys=... ."
-        )
-    parent = spec[key[:-1]] if isinstance(key, tuple) else spec
-    check_vector(spec[key], key, owner, parent.ndim)
-    return spec[key]
-
-
 def unbounded_like(leaf: TensorSpec) -> Unbounded:
     """Return an unbounded spec with the shape, device and dtype of `leaf`."""
     return Unbounded(shape=leaf.shape, device=leaf.device, dtype=leaf.dtype)
@@ -133,7 +113,7 @@ def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transfor
     spec[key] = leaf
 
 
-# ------------------------------------------------------------------------------------------ order
+# ------------------------------------------------------------------------------------- environment
 def environment_of(transform: Transform) -> EnvBase | None:
     """Return the environment that holds the transform, if any does."""
     try:
@@ -143,11 +123,8 @@ def environment_of(transform: Transform) -> EnvBase | None:
     return env
 
 
-def transforms_before(transform: Transform) -> Iterator[Transform]:
-    """Yield the transforms that work before `transform`, in its environment and those inside it.
-
-    Transforms inside the workers of a batched environment can't be seen.
-    """
+def _transforms_before(transform: Transform) -> Iterator[Transform]:
+    """Yield the transforms that come before `transform`; those inside workers can't be seen."""
     env = environment_of(transform)
     while isinstance(env, TransformedEnv):
         for part in env.transform.modules():
@@ -158,12 +135,22 @@ def transforms_before(transform: Transform) -> Iterator[Transform]:
         env = env.base_env
 
 
-# ------------------------------------------------------------------------------------- transforms
-class EnvironmentTransform(Transform):
-    """A transform that makes sense in an environment alone: it refuses stored data.
+def flagged_rows(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> Tensor | None:
+    """Return the rows that `"_reset"`, beside `key` or above it, marks, spread over `value`."""
+    folders = key[:-1] if isinstance(key, tuple) else ()
+    for depth in range(len(folders), -1, -1):
+        flag = tensordict.get((*folders[:depth], "_reset"), None)
+        if flag is not None:
+            rows = flag.flatten(tensordict.ndim).any(-1) if flag.ndim > tensordict.ndim else flag
+            return rows.reshape(*rows.shape, *(1,) * (value.ndim - rows.ndim)).expand_as(value)
+    return None
 
-    A replay buffer calls `inv` on what comes in and `forward` on what goes out. Subclasses say in
-    `why_online` why they can do neither.
+
+class EnvironmentTransform(Transform):
+    """A transform that works in an environment alone and refuses stored data.
+
+    A replay buffer calls `inv` on what comes in and `forward` on what goes out. `why_online` is
+    the reason in the error message.
     """
 
     why_online: ClassVar[str]
@@ -180,25 +167,19 @@ class EnvironmentTransform(Transform):
             raise self._refuse()
         return tensordict
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
-        """Refuse to work outside an environment.
-
-        Args:
-            tensordict: data of a replay buffer or in front of a model.
-
-        Raises:
-            NotImplementedError: always.
-        """
+    def forward(self, _: TensorDictBase) -> TensorDictBase:
+        """Raise a NotImplementedError: stored data can't be transformed."""
         raise self._refuse()
 
 
+# -------------------------------------------------------------------------------------- corruption
 class Step(NamedTuple):
-    """What a corrupting transform is given.
+    """What a corrupting transform works on.
 
     Attributes:
         observation: shape `(*batch, obs)`, the keys of one vector side by side.
-        observed: the mask so far, bool, same shape; None for all. Entries that it hides hold 0 in
-            the end, whatever is made of them.
+        observed: the mask so far, bool, same shape; None for all. Entries that it hides become 0
+            whatever `_corrupt` makes of them.
         before: the data of the step before, with the action; None at a reset.
         data: the data of this step, where what was drawn may be written.
     """
@@ -214,13 +195,8 @@ class CorruptingTransform(Transform):
 
     Several observation keys count as one vector, in the order of `in_keys`, so that one law holds
     for the whole observation however it is cut into keys; keys under `"next"` are a vector of
-    their own. A subclass writes `_corrupt`.
-
-    Args:
-        in_keys: observation keys; the corrupted observation is written under the same key.
-        mask_keys: one mask per observation; by default `observed` beside it.
-        complete_key: where the observation as it arrives is recorded; one key per observation, or
-            None for not at all.
+    their own. Shapes and dtypes are checked in the specs, in the first data (a reset comes before
+    the specs), and in data from outside an environment. A subclass writes `_corrupt`.
     """
 
     role: ClassVar[Role]
@@ -246,6 +222,7 @@ class CorruptingTransform(Transform):
         out_keys = [*keys, *(masks if self.writes_mask else []), *complete]
         super().__init__(in_keys=keys, out_keys=out_keys)
         self.mask_keys, self.complete_keys = masks, complete
+        self._checked = False
         of_next = [isinstance(key, tuple) and key[0] == "next" for key in keys]
         self._vectors = [
             [place for place, there in enumerate(of_next) if there is following]
@@ -259,20 +236,30 @@ class CorruptingTransform(Transform):
     def _check_obs_dim(self, obs_dim: int) -> None:
         """Raise a ValueError where the transform was made for another number of components."""
 
+    def _check(self, source: Composite | TensorDictBase) -> list[Any]:
+        """Return the specs or the data of the observations, checked."""
+        leaves = [read_vector(source, key, self) for key in self.in_keys]
+        for mask_key, leaf in zip(self.mask_keys, leaves, strict=True):
+            if mask_key in source.keys(True, True):
+                check_mask(source[mask_key], leaf, mask_key)
+        for vector in ([leaves[place] for place in places] for places in self._vectors):
+            if any(leaf.shape[:-1] != vector[0].shape[:-1] for leaf in vector):
+                raise ValueError(
+                    f"`in_keys` {self.in_keys} must share their batch to count as one vector, got "
+                    f"shapes {[tuple(leaf.shape) for leaf in vector]}. Give each batch a transform "
+                    "of its own."
+                )
+            self._check_obs_dim(sum(leaf.shape[-1] for leaf in vector))
+        return leaves
+
     # ------------------------------------------------------------------------------- on tensors
     def _run(self, tensordict: TensorDictBase, before: TensorDictBase | None) -> TensorDictBase:
-        if self.missing_tolerance and any(tensordict.get(k, None) is None for k in self.in_keys):
-            return tensordict
+        if not self._checked:
+            self._check(tensordict)
+            self._checked = True
         for places in self._vectors:
-            parts, masks = [], []
-            for key, mask_key in ((self.in_keys[i], self.mask_keys[i]) for i in places):
-                part, mask = read(tensordict, key, self), tensordict.get(mask_key, None)
-                check_vector(part, key, self)
-                if mask is not None:
-                    check_mask(mask, part, mask_key)
-                parts.append(part)
-                masks.append(mask)
-            self._check_batches(parts)
+            parts: list[Tensor] = [tensordict.get(self.in_keys[place]) for place in places]
+            masks = [tensordict.get(self.mask_keys[place], None) for place in places]
             observed = None
             if any(mask is not None for mask in masks):
                 pairs = zip(parts, masks, strict=True)
@@ -289,17 +276,9 @@ class CorruptingTransform(Transform):
             if self.writes_mask and arrived is not None:
                 written.append((self.mask_keys, _split(arrived, parts)))
             for keys, values in written:
-                for i, value in zip(places, values, strict=True):
-                    tensordict.set(keys[i], value)
+                for place, value in zip(places, values, strict=True):
+                    tensordict.set(keys[place], value)
         return tensordict
-
-    def _check_batches(self, parts: Sequence[Tensor | TensorSpec]) -> None:
-        if any(part.shape[:-1] != parts[0].shape[:-1] for part in parts):
-            raise ValueError(
-                f"`in_keys` {self.in_keys} must share their batch to count as one vector, got "
-                f"shapes {[tuple(part.shape) for part in parts]}. Give each batch a transform of "
-                "its own."
-            )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._run(next_tensordict, None)
@@ -307,17 +286,14 @@ class CorruptingTransform(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._run(next_tensordict, tensordict)
 
-    def _reset(
-        self,
-        tensordict: TensorDictBase,  # noqa: ARG002
-        tensordict_reset: TensorDictBase,
-    ) -> TensorDictBase:
+    def _reset(self, _: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # the first observation of an episode arrives through the same sensors as every other
         return self._run(tensordict_reset, None)
 
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the transform to data outside an environment, as on a replay buffer."""
+        self._checked = False
         return self._call(tensordict)
 
     # ------------------------------------------------------------------------------------- specs
@@ -325,14 +301,10 @@ class CorruptingTransform(Transform):
         """Widen the observation, enter its mask and, on request, the complete observation."""
         self._check_order()
         spec = observation_spec.clone()
-        leaves = [observation_leaf(spec, key, self) for key in self.in_keys]
-        self._check_batches(leaves)
-        self._check_obs_dim(sum(leaf.shape[-1] for leaf in leaves))
+        leaves = self._check(spec)
         for key, leaf in zip(self.complete_keys, leaves, strict=bool(self.complete_keys)):
             enter_new(spec, key, leaf.clone(), self)
         for key, mask_key, leaf in zip(self.in_keys, self.mask_keys, leaves, strict=True):
-            if mask_key in spec.keys(True, True):
-                check_mask(spec[mask_key], leaf, mask_key)
             if self.writes_mask:
                 spec[mask_key] = mask_like(leaf)
             spec[key] = unbounded_like(leaf)
@@ -340,7 +312,7 @@ class CorruptingTransform(Transform):
 
     def _check_order(self) -> None:
         name, keys = type(self).__name__, set(self.in_keys)
-        for earlier in transforms_before(self):
+        for earlier in _transforms_before(self):
             role, other = getattr(earlier, "role", None), type(earlier).__name__
             if role is None or keys.isdisjoint([*earlier.in_keys, *earlier.out_keys]):
                 continue
@@ -362,6 +334,7 @@ def _join(parts: list[Tensor]) -> Tensor:
 
 
 def _split(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
-    sizes = [part.shape[-1] for part in parts]
-    pieces: Sequence[Tensor] = [joined] if len(parts) == 1 else torch.split(joined, sizes, -1)
+    if len(parts) == 1:
+        return [joined]
+    pieces: Sequence[Tensor] = torch.split(joined, [part.shape[-1] for part in parts], -1)
     return pieces

@@ -18,7 +18,7 @@ from torchrl_drbpn.transforms._base import (
     Step,
     as_key_list,
     enter_new,
-    observation_leaf,
+    read_vector,
     sibling_key,
 )
 from torchrl_drbpn.transforms.seeding import SeededTransform
@@ -59,7 +59,6 @@ class CarriedStateTransform(SeededTransform):
             )
         self.out_keys = [*self.out_keys, *self.state_keys]
         self._columns: Tensor | None = None
-        self._fits: int | None = None
 
     # ------------------------------------------------------------------------------------ groups
     def _count(self, obs_dim: int) -> int:
@@ -82,10 +81,10 @@ class CarriedStateTransform(SeededTransform):
 
     def _columns_for(self, observation: Tensor) -> Tensor:
         """Return the group of every component; the number of groups where it is in none."""
-        columns, obs_dim = self._columns, observation.shape[-1]
-        if columns is None or columns.shape[0] != obs_dim or columns.device != observation.device:
+        columns = self._columns
+        if columns is None or columns.device != observation.device:
             groups = self.groups or []
-            columns = torch.full((obs_dim,), len(groups))
+            columns = torch.full(observation.shape[-1:], len(groups))
             for index, group in enumerate(groups):
                 columns[group] = index
             columns = self._columns = columns.to(observation.device)
@@ -110,11 +109,8 @@ class CarriedStateTransform(SeededTransform):
         raise NotImplementedError
 
     def _carried(self, step: Step) -> list[Tensor] | None:
-        """Return the states after the step before, None at a reset; call it first in a step."""
+        """Return the states after the step before, None at a reset."""
         x, states = step.observation, []
-        if self._fits != x.shape[-1]:
-            self._check_obs_dim(x.shape[-1])
-            self._fits = x.shape[-1]
         if step.before is None:
             return None
         layout = self._layout(x.shape[-1])
@@ -142,7 +138,7 @@ class CarriedStateTransform(SeededTransform):
             step.data.set(key, state)
 
     def _state_specs(self, spec: Composite) -> list[TensorSpec]:
-        leaves = [observation_leaf(spec, key, self) for key in self.in_keys]
+        leaves = [read_vector(spec, key, self) for key in self.in_keys]
         made: list[TensorSpec] = []
         for event, dtype in self._layout(sum(leaf.shape[-1] for leaf in leaves)):
             shape, device = (*leaves[0].shape[:-1], *event), leaves[0].device

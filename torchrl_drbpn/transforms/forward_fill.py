@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.data import Composite
 
 from torchrl_drbpn.transforms._base import (
@@ -14,11 +14,10 @@ from torchrl_drbpn.transforms._base import (
     Role,
     as_key_list,
     check_mask,
-    check_vector,
     flagged_rows,
-    observation_leaf,
+    last_name,
     pair_keys,
-    read,
+    read_vector,
     sibling_key,
     unbounded_like,
 )
@@ -45,8 +44,7 @@ class FillLastObserved(EnvironmentTransform):
             Default `last_<name>` beside each observation.
 
     Raises:
-        ValueError: numbers of keys that do not match, or, when the
-            environment is asked for its specs, missingness stands after the transform.
+        ValueError: if numbers of keys do not match, or missingness stands after the transform.
 
     Examples:
         >>> import torch
@@ -76,23 +74,31 @@ class FillLastObserved(EnvironmentTransform):
         super().__init__(in_keys=inputs, out_keys=outputs)
         self.mask_keys = pair_keys(inputs, mask_keys, name="mask_keys", default="observed")
         if state_keys is None:
-            names = [key[-1] if isinstance(key, tuple) else key for key in inputs]
-            state_keys = [
-                sibling_key(key, f"last_{name}") for key, name in zip(inputs, names, strict=True)
-            ]
+            state_keys = [sibling_key(key, f"last_{last_name(key)}") for key in inputs]
         self.state_keys = pair_keys(inputs, state_keys, name="state_keys", default="")
         self.fill_value = float(fill_value)
         self._keys = list(
             zip(self.in_keys, self.mask_keys, self.out_keys, self.state_keys, strict=True)
         )
+        self._checked = False
+
+    def _check(self, source: Composite | TensorDictBase) -> None:
+        for key, mask_key in zip(self.in_keys, self.mask_keys, strict=True):
+            leaf = read_vector(source, key, self)
+            if mask_key not in source.keys(True, True):
+                raise KeyError(
+                    f"`FillLastObserved` reads the mask {mask_key!r}, which the environment does "
+                    "not write. Put ObservationMissingness, SensorReduction or ObservedFromNaN "
+                    "before it, or pass mask_keys=... ."
+                )
+            check_mask(source[mask_key], leaf, mask_key)
 
     def _fill(self, last: TensorDictBase | None, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self._checked:
+            self._check(tensordict)
+            self._checked = True
         for key, mask_key, out_key, state_key in self._keys:
-            value, observed = read(tensordict, key, self), tensordict.get(mask_key, None)
-            if observed is None:
-                raise _no_mask(mask_key)
-            check_vector(value, key, self)
-            check_mask(observed, value, mask_key)
+            value, observed = tensordict.get(key), tensordict.get(mask_key)
             previous = None if last is None else last.get(state_key, None)
             filled = torch.where(observed, value, self.fill_value if previous is None else previous)
             tensordict.set(out_key, filled)
@@ -102,51 +108,36 @@ class FillLastObserved(EnvironmentTransform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._fill(tensordict, next_tensordict)
 
-    def _reset(
-        self,
-        tensordict: TensorDictBase,  # noqa: ARG002
-        tensordict_reset: TensorDictBase,
-    ) -> TensorDictBase:
+    def _reset(self, _: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # every row: the environment keeps the old values of the rows that are not reset
         return self._fill(None, tensordict_reset)
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # The first observation was filled as if its episode were the one before; the mask tells
+        # The first observation was filled as if its episode were the one before; the mask says
         # where. Exact unless a transform after this one has rescaled the observation.
         for _, mask_key, out_key, state_key in self._keys:
-            value = tensordict_reset.get(out_key, None)
-            rows = None if value is None else flagged_rows(tensordict, out_key, value)
+            rows = flagged_rows(tensordict, out_key, tensordict_reset.get(out_key))
             if rows is not None:
-                stale = rows & ~read(tensordict_reset, mask_key, self)
-                last = read(tensordict_reset, state_key, self)
-                tensordict_reset.set(out_key, value.masked_fill(stale, self.fill_value))
-                tensordict_reset.set(state_key, last.masked_fill(stale, self.fill_value))
+                stale = rows & ~tensordict_reset.get(mask_key)
+                for key in (out_key, state_key):
+                    value = tensordict_reset.get(key)
+                    tensordict_reset.set(key, value.masked_fill(stale, self.fill_value))
         return tensordict_reset
 
     # ------------------------------------------------------------------------------------- specs
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Enter the filled observations and the last values, unbounded."""
-        for key, mask_key, out_key, state_key in self._keys:
-            leaf = observation_leaf(observation_spec, key, self)
-            if mask_key not in observation_spec.keys(True, True):
-                raise _no_mask(mask_key)
-            observation_spec[out_key] = unbounded_like(leaf)
-            observation_spec[state_key] = unbounded_like(leaf)
+        self._check(observation_spec)
+        for key, _, out_key, state_key in self._keys:
+            leaf = unbounded_like(observation_spec[key])
+            observation_spec[out_key], observation_spec[state_key] = leaf, leaf.clone()
         return observation_spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         """Enter the last values as a state that a step reads."""
         observation_spec = self.parent.full_observation_spec
-        for key, _, _, state_key in self._keys:
-            state_spec[state_key] = unbounded_like(observation_leaf(observation_spec, key, self))
+        for key, state_key in zip(self.in_keys, self.state_keys, strict=True):
+            state_spec[state_key] = unbounded_like(observation_spec[key])
         return state_spec
-
-
-def _no_mask(mask_key: NestedKey) -> KeyError:
-    return KeyError(
-        f"`FillLastObserved` reads the mask {mask_key!r}, which the environment does not write. "
-        "Put ObservationMissingness, SensorReduction or ObservedFromNaN before it, or pass "
-        "mask_keys=... ."
-    )

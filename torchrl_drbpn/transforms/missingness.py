@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from numbers import Real
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -18,7 +19,14 @@ from torchrl_drbpn.functional.missingness import (
     missing_probability,
     sample_mask,
 )
-from torchrl_drbpn.transforms._base import CorruptingTransform, Keys, Role, Step, as_key_list, read
+from torchrl_drbpn.transforms._base import (
+    CorruptingTransform,
+    Keys,
+    Role,
+    Step,
+    as_key_list,
+    read_leaf,
+)
 from torchrl_drbpn.transforms.seeding import SeededTransform, check_seed
 
 _KINDS = ("mcar", "mar", "nmar")
@@ -51,7 +59,7 @@ class ObservationMissingness(SeededTransform):
         always_observed: share of the components that always arrive (mar, nmar), in [0, 1).
         mechanism_seed: seed of the mechanism's parameters, not negative.
         seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same masks to every worker and every transform that is built with it.
+            which gives the same draws to every worker and every transform that is built with it.
         in_keys: observation keys, each of shape `(*batch, obs)`.
         mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
         complete_key: key (or one key per observation) under which the observation is recorded
@@ -70,6 +78,10 @@ class ObservationMissingness(SeededTransform):
         True
         >>> bool((data["observed"].float().mean() - 0.5).abs() < 0.02)
         True
+
+    Attributes:
+        mechanism_parameters: always observed components and b0, b1, b2, in the dtype and on the
+            device of the data; None under "mcar" and before the first step.
 
     See also: `torchrl_drbpn.functional.missing_probability`, `sample_mask`.
     """
@@ -94,20 +106,17 @@ class ObservationMissingness(SeededTransform):
         super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
         if mechanism not in _KINDS:
             raise ValueError(f"`mechanism` must be one of {_KINDS}, got {mechanism!r}.")
-        if not 0.0 <= always_observed <= 1.0:
-            raise ValueError(f"`always_observed` must be a share in [0, 1], got {always_observed}.")
-        if mechanism != "mcar" and always_observed == 1.0:
+        if mechanism != "mcar" and not 0.0 <= always_observed < 1.0:
             raise ValueError(
-                "`always_observed` must leave components that can go missing, got 1.0, with which "
-                "nothing is ever missing. Pass a smaller share, or eta=0.0 for complete data."
+                f"`always_observed` must be a share in [0, 1), got {always_observed}: with 1 "
+                "nothing is ever missing. Pass eta=0.0 for complete data."
             )
         self.mechanism = mechanism
         self.eta = eta
         self.always_observed = always_observed
         self.mechanism_seed = check_seed(mechanism_seed, "mechanism_seed")
         (self.action_key,) = as_key_list(action_key)
-        self._drawn: MissingnessMechanism | None = None
-        self._cast: MissingnessMechanism | None = None
+        self.mechanism_parameters: MissingnessMechanism | None = None
 
     @property
     def eta(self) -> float:
@@ -120,24 +129,29 @@ class ObservationMissingness(SeededTransform):
             raise ValueError(f"`eta` must be a missing rate in [0, 1], got {eta!r}.")
         self._eta = float(eta)
 
-    @property
-    def mechanism_parameters(self) -> MissingnessMechanism | None:
-        """Always observed components and b0, b1, b2; None under "mcar" or before the first step."""
-        return self._drawn
-
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         x, generator = step.observation, self.generator(step.observation.device)
         if self.mechanism == "mcar":
             return x, sample_mask(self._eta, x, generator)
         action = None if step.before is None else self._action(step.before, x)
-        parameters = self._mechanism_for(x, action)
-        # what an earlier transform hides enters no law
+        # what an earlier transform hides does not enter the probability
         seen = x if step.observed is None else zero_missing(x, step.observed)
-        law = missing_probability(parameters, seen, action, self._eta)
-        return x, sample_mask(law, x, generator)
+        mechanism = _drawn(
+            self.mechanism,
+            (x.shape[-1], 0 if action is None else action.shape[-1]),
+            self.always_observed,
+            self.mechanism_seed,
+            x.dtype,
+            x.device,
+        )
+        if action is not None:
+            self.mechanism_parameters = mechanism
+        return x, sample_mask(missing_probability(mechanism, seen, action, self._eta), x, generator)
 
-    def _action(self, root: TensorDictBase, observation: Tensor) -> Tensor:
-        action = read(root, self.action_key, self)
+    def _action(self, before: TensorDictBase, observation: Tensor) -> Tensor:
+        action: Tensor | None = before.get(self.action_key, None)
+        if action is None:
+            action = read_leaf(before, self.action_key, self)
         if action.shape[:-1] != observation.shape[:-1] or action.ndim == 0:
             raise ValueError(
                 f"`{self.action_key}` must be a vector of shape (*batch, action) with batch "
@@ -146,77 +160,28 @@ class ObservationMissingness(SeededTransform):
             )
         return action.to(observation.dtype)
 
-    def _mechanism_for(self, observation: Tensor, action: Tensor | None) -> MissingnessMechanism:
-        """Return the mechanism in the dtype and on the device of the observation."""
-        drawn = self._drawn
-        if drawn is None:
-            drawn = draw_mechanism(
-                "mar" if self.mechanism == "mar" else "nmar",
-                observation.shape[-1],
-                0 if action is None else action.shape[-1],
-                always_observed=self.always_observed,
-                generator=torch.Generator().manual_seed(self.mechanism_seed),
-            )
-            # the first reset does not know the action, whose weights are drawn last
-            self._drawn = None if action is None else drawn
-        obs_dim, action_dim = drawn.action_weight.shape
-        received = observation.shape[-1], action_dim if action is None else action.shape[-1]
-        if received != (obs_dim, action_dim):
-            raise ValueError(
-                f"`{self.in_keys}` must have {obs_dim} components and `{self.action_key}` "
-                f"{action_dim}, for which the mechanism was drawn or loaded, got {received[0]} and "
-                f"{received[1]}. Is the state of another environment?"
-            )
-        cast = self._cast
-        if cast is None or (cast.bias.dtype, cast.bias.device) != (
-            observation.dtype,
-            observation.device,
-        ):
-            always = drawn.always_observed.to(observation.device)
-            cast = MissingnessMechanism(always, *(part.to(observation) for part in drawn[1:]))
-            self._cast = None if self._drawn is None else cast
-        return cast
 
-    # -------------------------------------------------------------------------------------- state
-    def get_extra_state(self) -> dict[str, Tensor]:
-        """Return seed, generator state and the mechanism's parameters as tensors."""
-        state = super().get_extra_state()
-        if self._drawn is not None:
-            state |= {f"mechanism.{k}": v for k, v in self._drawn._asdict().items()}
-            state["mechanism.kind"] = torch.tensor(_KINDS.index(self.mechanism))
-            state["mechanism.seed"] = torch.tensor(self.mechanism_seed)
-        return state
-
-    def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `get_extra_state` returned.
-
-        Parameters of another mechanism are passed over, so that an agent trained under "mar" can be
-        evaluated under "mcar" with the rest of its state.
-
-        Args:
-            state: seed, generator state, parameters.
-
-        Raises:
-            ValueError: the state is that of the same mechanism with another `mechanism_seed`.
-        """
-        same = _KINDS.index(self.mechanism) == int(state.get("mechanism.kind", -1))
-        drawn_by = int(state.get("mechanism.seed", self.mechanism_seed))
-        if same and drawn_by != self.mechanism_seed:
-            raise ValueError(
-                f"the state is that of mechanism_seed {drawn_by}, this transform has "
-                f"mechanism_seed {self.mechanism_seed}: they lose other sensors. Build it with "
-                f"mechanism_seed={drawn_by}."
-            )
-        super().set_extra_state(state)
-        if same:
-            parts = (state[f"mechanism.{name}"].cpu() for name in MissingnessMechanism._fields)
-            self._drawn, self._cast = MissingnessMechanism(*parts), None
+@lru_cache(maxsize=32)
+def _drawn(
+    kind: Literal["mar", "nmar"],
+    sizes: tuple[int, int],
+    always_observed: float,
+    seed: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> MissingnessMechanism:
+    """Return the mechanism of a seed; a reset asks for it without the weights of an action."""
+    generator = torch.Generator().manual_seed(seed)
+    always, *parts = draw_mechanism(
+        kind, *sizes, always_observed=always_observed, generator=generator
+    )
+    return MissingnessMechanism(always.to(device), *(part.to(device, dtype) for part in parts))
 
 
 class SensorReduction(CorruptingTransform):
     """Take sensors away for good: the named components never arrive.
 
-    Nothing is drawn, so that it may stand in an environment as well as on a replay buffer: with
+    Nothing is drawn, so that it works in an environment and on a replay buffer: with
     `in_keys=["observation", ("next", "observation")]` both lose the same sensors.
 
     Args:
@@ -226,10 +191,7 @@ class SensorReduction(CorruptingTransform):
             own. Several observation keys count as one vector.
 
     Keyword Args:
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before this transform; None, the default, records nothing.
+        in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
 
     Raises:
         ValueError: if an index is out of range or the bool tensor is of another shape.
@@ -283,17 +245,14 @@ class SensorReduction(CorruptingTransform):
             )
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
-        observation = step.observation
-        obs_dim, device = observation.shape[-1], observation.device
-        present = self._present
-        if present is None or present.shape[-1] != obs_dim or present.device != device:
-            self._check_obs_dim(obs_dim)
+        observation, present = step.observation, self._present
+        if present is None or present.device != observation.device:
             if self.missing.dtype == torch.bool:
                 present = ~self.missing
             else:
-                present = torch.ones(obs_dim, dtype=torch.bool)
+                present = torch.ones(observation.shape[-1], dtype=torch.bool)
                 present[self.missing] = False
-            present = self._present = present.to(device)
+            present = self._present = present.to(observation.device)
         if present.ndim > 1 and present.shape != observation.shape:
             # never broadcast: rows that were meant for other environments would go unnoticed
             raise ValueError(
@@ -313,8 +272,7 @@ class ObservedFromNaN(CorruptingTransform):
     Infinite values are left: they are errors, not gaps.
 
     Keyword Args:
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
+        in_keys, mask_keys: as in `ObservationMissingness`.
 
     Example:
         >>> import torch

@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite
 
 from torchrl_drbpn.functional.missingness import sample_noise, sample_spikes
 from torchrl_drbpn.transforms._base import Keys, Role, Step, enter_new, mask_like, pair_keys
 from torchrl_drbpn.transforms.seeding import SeededTransform
+
+STD = "finite and not negative, in observation units"
 
 
 class PerComponent:
@@ -32,7 +35,6 @@ class PerComponent:
             )
         self.name = name
         self.value: float | Tensor = float(read) if read.ndim == 0 else read
-        self._cast = self.value
 
     def check_obs_dim(self, obs_dim: int) -> None:
         """Refuse numbers that are neither one nor as many as there are components."""
@@ -44,14 +46,7 @@ class PerComponent:
 
     def like(self, observation: Tensor) -> float | Tensor:
         """Return the numbers on the device and in the dtype of `observation`."""
-        self.check_obs_dim(observation.shape[-1])
-        cast = self._cast
-        if isinstance(cast, Tensor) and (cast.dtype, cast.device) != (
-            observation.dtype,
-            observation.device,
-        ):
-            cast = self._cast = cast.to(observation)
-        return cast
+        return self.value.to(observation) if isinstance(self.value, Tensor) else self.value
 
 
 class ObservationNoise(SeededTransform):
@@ -68,12 +63,7 @@ class ObservationNoise(SeededTransform):
             component, shape `(obs,)`.
 
     Keyword Args:
-        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same noise to every worker and every transform that is built with it.
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, read where it exists; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before the noise; None, the default, records nothing.
+        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
 
     Raises:
         ValueError: if a standard deviation is negative or not finite, or their number is not that
@@ -138,12 +128,7 @@ class ObservationSpikes(SeededTransform):
             component, shape `(obs,)`.
 
     Keyword Args:
-        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same spikes to every worker and every transform that is built with it.
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, read where it exists; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before the spikes; None, the default, records nothing.
+        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         spiked_key: key (or one key per observation) under which the entries that were hit are
             recorded, bool `(*batch, obs)`; None, the default, records nothing. For evaluation: no
             policy should read it.
@@ -179,11 +164,9 @@ class ObservationSpikes(SeededTransform):
         spiked_key: Keys | None = None,
     ) -> None:
         super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
-        self.spiked_keys = (
-            []
-            if spiked_key is None
-            else pair_keys(self.in_keys, spiked_key, name="spiked_key", default="")
-        )
+        self.spiked_keys: list[NestedKey] = []
+        if spiked_key is not None:
+            self.spiked_keys = pair_keys(self.in_keys, spiked_key, name="spiked_key", default="")
         taken = [*self.in_keys, *self.mask_keys, *self.complete_keys]
         if not set(self.spiked_keys).isdisjoint(taken):
             raise ValueError(
@@ -224,6 +207,3 @@ class ObservationSpikes(SeededTransform):
         for key, spiked in zip(self.in_keys, self.spiked_keys, strict=False):
             enter_new(spec, spiked, mask_like(spec[key]), self)
         return spec
-
-
-STD = "finite and not negative, in observation units"

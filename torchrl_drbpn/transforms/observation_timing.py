@@ -41,12 +41,7 @@ class ObservationDelay(CarriedStateTransform):
         groups: lists of indices that travel together, in one packet (negative ones count from the
             end), each index in one list at most; entries in none arrive at once. None, the default:
             every entry by itself. Several observation keys count as one vector.
-        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same delays to every worker and every transform built with it.
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before this transform; None, the default, records nothing.
+        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         state_keys: where what is on its way is kept, its values and its mask, each of shape
             `(*batch, max_delay, obs)`; by default `delayed_observation` and `delayed_observed`
             beside the first observation.
@@ -176,12 +171,7 @@ class ObservationMultiRate(CarriedStateTransform):
         groups: lists of indices of sensors that deliver together (negative ones count from the
             end), each index in one list at most; entries in none arrive at every step. None, the
             default: every entry by itself. Several observation keys count as one vector.
-        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same phases to every worker and every transform built with it.
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before this transform; None, the default, records nothing.
+        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         state_keys: where the steps until the next reading are kept, int64 `(*batch, groups)`, 0
             where one arrives; by default `steps_to_reading` beside the first observation.
 

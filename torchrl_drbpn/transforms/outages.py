@@ -50,12 +50,7 @@ class SensorOutages(CarriedStateTransform):
             in one list at most; entries in none always arrive. None, the default: every entry by
             itself. Several observation keys count as one vector.
         initial: "stationary" or "on"; the sensors at the start of an episode.
-        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same outages to every worker and every transform built with it.
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before this transform; None, the default, records nothing.
+        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         state_key: where the state is kept, bool `(*batch, groups)`, True for a group that works; by
             default `sensor_on` beside the first observation. Two `SensorOutages` in one environment
             need two.

@@ -6,17 +6,19 @@ from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
 from torchrl_drbpn.transforms._base import (
     EnvironmentTransform,
     Keys,
     as_key_list,
     flagged_rows,
+    last_name,
+    mask_like,
     pair_keys,
-    read,
+    read_leaf,
     sibling_key,
+    unbounded_like,
 )
 
 
@@ -63,11 +65,9 @@ class PreviousAction(EnvironmentTransform):
         self.one_hot = one_hot
         # What travels from the way in to the way out, where earlier action transforms have
         # overwritten the action: one entry per action, never seen outside a step.
-        self._chosen = [
-            sibling_key(key, f"_chosen_{key[-1] if isinstance(key, tuple) else key}")
-            for key in inputs
-        ]
-        self._layouts: dict[NestedKey, tuple[torch.Size, TensorSpec]] = {}
+        self._chosen = [sibling_key(key, f"_chosen_{last_name(key)}") for key in inputs]
+        # specs are slow to ask and short episodes reset often
+        self._leaves: dict[NestedKey, TensorSpec] = {}
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = super()._inv_call(tensordict)
@@ -81,76 +81,54 @@ class PreviousAction(EnvironmentTransform):
         for key, out_key, chosen in zip(self.in_keys, self.out_keys, self._chosen, strict=True):
             action = tensordict.get(chosen, None)
             if action is None:
-                action = read(tensordict, key, self)
+                action = read_leaf(tensordict, key, self)
             if self.one_hot:
-                event_shape, leaf = self._layout(key)
-                codes = torch.arange(event_shape[-1], device=action.device)
+                leaf = self._leaf(key)
+                codes = torch.arange(leaf.shape[-1], device=action.device)
                 action = (action.unsqueeze(-1) == codes).to(leaf.dtype)
             next_tensordict.set(out_key, action)
         return next_tensordict
 
-    def _reset(
-        self,
-        tensordict: TensorDictBase,  # noqa: ARG002
-        tensordict_reset: TensorDictBase,
-    ) -> TensorDictBase:
+    def _reset(self, _: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # every row: the environment keeps the old values of the rows that are not reset
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            tensordict_reset.set(out_key, self._zero(key, tensordict_reset))
+            tensordict_reset.set(out_key, self._leaf(key).zero())
         return tensordict_reset
-
-    def _zero(self, key: NestedKey, tensordict_reset: TensorDictBase) -> Tensor:
-        if self.parent is None:
-            return torch.zeros_like(read(tensordict_reset, key, self))
-        event_shape, leaf = self._layout(key)
-        shape = (*tensordict_reset.batch_size, *event_shape)
-        return torch.zeros(shape, dtype=leaf.dtype, device=leaf.device)
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         for key in self.out_keys:
-            value = tensordict_reset.get(key, None)
-            rows = None if value is None else flagged_rows(tensordict, key, value)
+            value = tensordict_reset.get(key)
+            rows = flagged_rows(tensordict, key, value)
             if rows is not None:
                 tensordict_reset.set(key, value.masked_fill(rows, 0))
         return tensordict_reset
 
     # ------------------------------------------------------------------------------------- specs
-    def _layout(self, key: NestedKey) -> tuple[torch.Size, TensorSpec]:
-        # specs are slow to ask and short episodes reset often
-        if key not in self._layouts:
-            leaf = self._leaf(key)
-            self._layouts[key] = leaf.shape[len(self.parent.batch_size) :], leaf
-        return self._layouts[key]
-
     def _leaf(self, key: NestedKey) -> TensorSpec:
-        spec = self.parent.full_action_spec
-        if key not in spec.keys(True, True):
-            raise KeyError(
-                f"`PreviousAction` reads {key!r}, which is not among the actions "
-                f"{sorted(map(str, spec.keys(True, True)))} of the environment. Pass in_keys=... ."
-            )
-        leaf = spec[key]
+        """Return the spec of the previous action, which is zero after a reset: no action's own."""
+        if key in self._leaves:
+            return self._leaves[key]
+        leaf = read_leaf(self.parent.full_action_spec, key, self)
         if self.one_hot:
             if type(leaf) is not Categorical:
                 raise ValueError(
                     f"`one_hot` needs an index action (Categorical), got {type(leaf).__name__} "
                     f"under {key!r}, which needs no coding. Leave one_hot=False."
                 )
-            return Unbounded(shape=(*leaf.shape, leaf.n), device=leaf.device)
-        # zeros need not be a valid action, hence not the action's own spec
-        if leaf.dtype is torch.bool:
-            return Binary(shape=leaf.shape, device=leaf.device, dtype=leaf.dtype)
-        return Unbounded(shape=leaf.shape, device=leaf.device, dtype=leaf.dtype)
+            made: TensorSpec = Unbounded(shape=(*leaf.shape, leaf.n), device=leaf.device)
+        else:
+            made = mask_like(leaf) if leaf.dtype is torch.bool else unbounded_like(leaf)
+        return self._leaves.setdefault(key, made)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Enter the previous action, unbounded."""
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            observation_spec[out_key] = self._leaf(key)
+            observation_spec[out_key] = self._leaf(key).clone()
         return observation_spec
 
     def empty_cache(self) -> None:
         """Forget what was read from the specs."""
         super().empty_cache()
-        self._layouts = {}
+        self._leaves = {}

@@ -31,7 +31,7 @@ def check_seed(seed: int, name: str = "seed") -> int:
 # ---------------------------------------------------------------------------- worker processes
 # The seed of torch's global generator as this process inherited it; None where it has its own. A
 # forked process starts with a copy of its parent's generator, so that siblings draw the same
-# numbers; in a child that imports this module late nobody can tell, and it is treated as forked.
+# numbers; a child that imports this module late is treated as forked.
 _inherited: int | None = torch.initial_seed() if multiprocessing.parent_process() else None
 
 
@@ -45,11 +45,9 @@ if hasattr(os, "register_at_fork"):
 
 
 def _separate_worker() -> None:
-    """Move a global generator that is a copy of the parent's on by the name of the process, once.
+    """Advance a global generator copied from the parent by the name of the process, once.
 
-    The one place where the library touches it other than by drawing. `torch.manual_seed` in the
-    process, as by `ParallelEnv.set_seed`, has the last word: before this it makes it superfluous,
-    after this it undoes it.
+    `torch.manual_seed` in the process, as by `ParallelEnv.set_seed`, before or after, overrides it.
     """
     global _inherited
     if _inherited is not None and torch.initial_seed() == _inherited:
@@ -63,20 +61,14 @@ def _separate_worker() -> None:
 class SeededTransform(EnvironmentTransform, CorruptingTransform):
     """A corrupting transform that draws.
 
-    With a seed it has a generator of its own, made on the device of the data: the global one is
-    neither read nor advanced, equal seeds give equal sequences, two classes with the same seed
-    unrelated ones, and the state of the generator is part of `state_dict`. Without one it draws
-    from torch's global generator, which `torch.manual_seed` seeds, and `env.set_seed` in the
-    workers of a `ParallelEnv`.
-
-    Args:
-        seed: seed of the generator, not negative, or None.
-        **keys: passed on to `CorruptingTransform`.
+    With a seed it has a generator of its own on the device of the data: the global one is neither
+    read nor advanced, two classes with the same seed give unrelated sequences, and the state of
+    the generator is part of `state_dict`. Without one it draws from torch's global generator, which
+    `torch.manual_seed` seeds, and `env.set_seed` in the workers of a `ParallelEnv`.
     """
 
     why_online = "draws afresh at every call"
-    # separates the random streams of the classes: noise and missingness with the same seed must not
-    # be built from the same uniform numbers
+    # one number a class, so that noise and missingness with the same seed are not correlated
     stream: ClassVar[int]
 
     def __init__(self, *, seed: int | None, **keys: Any) -> None:
@@ -86,11 +78,7 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
             _separate_worker()
 
     def set_seed(self, seed: int | None) -> None:
-        """Start the random sequence of `seed` from its beginning.
-
-        Args:
-            seed: the new seed, not negative; None for torch's global generator.
-        """
+        """Start the sequence of `seed`; None draws from torch's global generator."""
         self.seed = None if seed is None else check_seed(seed)
         self._generator: torch.Generator | None = None
         self._saved_state: Tensor | None = None
@@ -106,33 +94,25 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
             # golden-ratio steps spread neighbouring seeds, `stream` separates the classes
             mixed = self.seed * 0x9E3779B97F4A7C15 + self.stream * 0xD1B54A32D192ED03
             generator.manual_seed(mixed % (1 << _SEED_BITS))
-            if self._saved_state is not None:
-                self._restore(generator, self._saved_state)
-                self._saved_state = None
+            saved, self._saved_state = self._saved_state, None
+            size = generator.get_state().numel()
+            if saved is not None and saved.numel() == size:
+                generator.set_state(saved)
+            elif saved is not None:
+                warnings.warn(
+                    f"the saved generator state has {saved.numel()} bytes, one on {device} has "
+                    f"{size}: it was saved on another kind of device and can't be continued here. "
+                    "The sequence starts again from its seed.",
+                    stacklevel=2,
+                )
         return generator
-
-    @staticmethod
-    def _restore(generator: torch.Generator, state: Tensor) -> None:
-        size = generator.get_state().numel()
-        if state.numel() != size:
-            warnings.warn(
-                f"the saved generator state has {state.numel()} bytes, one on {generator.device} "
-                f"has {size}: it was saved on another kind of device and can't be continued here. "
-                "The sequence starts again from its seed.",
-                stacklevel=3,
-            )
-            return
-        generator.set_state(state)
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Return seed (-1 for None) and generator state as tensors, for `state_dict`."""
-        state = torch.empty(0, dtype=torch.uint8)
-        if self._generator is not None:
-            state = self._generator.get_state()
-        elif self._saved_state is not None:
-            state = self._saved_state
-        seed = -1 if self.seed is None else self.seed
-        return {"seed": torch.tensor(seed), "generator": state.clone()}
+        state = self._saved_state if self._generator is None else self._generator.get_state()
+        seed = torch.tensor(-1 if self.seed is None else self.seed)
+        empty = torch.empty(0, dtype=torch.uint8)
+        return {"seed": seed, "generator": empty if state is None else state.clone()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Continue from what `get_extra_state` returned."""
@@ -153,10 +133,10 @@ def seed_env(env: EnvBase, seed: int) -> int | None:
     """Seed `env` and every transform that draws, with a seed of its own for each.
 
     TorchRL's `env.set_seed` reaches the simulator, and torch's global generator in the workers of a
-    `ParallelEnv`. This also gives every transform that draws a generator of its own, in
-    `TransformedEnv`s within each other and in the workers of `SerialEnv` and `ParallelEnv`, so that
-    no two workers see the same noise and a seed reproduces everything, whatever else draws. The
-    `mechanism_seed` of a mechanism stays what it is.
+    `ParallelEnv`. This also gives every transform that draws a generator of its own, in nested
+    `TransformedEnv`s and in the workers of `SerialEnv` and `ParallelEnv`, so that workers see
+    different noise and a seed reproduces everything, whatever else draws. A `mechanism_seed` is
+    left alone.
 
     Not reached: environments wrapped twice or batched inside a worker, and those of collectors that
     run in processes of their own: seed those in the function that builds them.
@@ -213,8 +193,8 @@ def seed_env(env: EnvBase, seed: int) -> int | None:
 
 
 def _call_in_worker(env: ParallelEnv, index: int, path: list[str], seed: int) -> None:
-    # A chain of attributes asked of a ParallelEnv is looked up in its workers. Its load_state_dict
-    # would do, but leaves a signal behind that the next step takes for its own.
+    # ParallelEnv looks up a chain of attributes in its workers. Its load_state_dict would leave a
+    # signal behind that the next step takes for its own.
     target: Any = env[index].transform
     for name in [*path, "set_seed"]:
         target = getattr(target, name)

@@ -64,12 +64,7 @@ class StuckSensors(_FaultyReadings):
         groups: lists of indices of sensors that get stuck together (negative ones count from the
             end), each index in one list at most; entries in none never do. None, the default: every
             entry by itself. Several observation keys count as one vector.
-        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same faults to every worker and every transform built with it.
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, read where it exists; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before this transform; None, the default, records nothing.
+        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         state_keys: where the state is kept: the steps that a fault has lasted, int64 `(*batch,
             groups)`, 0 or less for a sensor that works, and what each shows, `(*batch, obs)`; by
             default `stuck_steps` and `stuck_observation` beside the first observation.
@@ -162,12 +157,7 @@ class SensorDrift(_FaultyReadings):
             count from the end), each with a bias of its own, each index in one list at most;
             entries in none never do. None, the default: every entry by itself. Several observation
             keys count as one vector.
-        seed: None, to draw from torch's global generator, or the seed of a generator of its own,
-            which gives the same drift to every worker and every transform built with it.
-        in_keys: observation keys, each of shape `(*batch, obs)`.
-        mask_keys: one mask per observation, read where it exists; by default `observed` beside it.
-        complete_key: key (or one key per observation) under which the observation is recorded
-            before this transform; None, the default, records nothing.
+        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         state_keys: where the state is kept: the steps that a sensor has drifted, int64 `(*batch,
             groups)`, 0 or less for one that does not, and the bias, `(*batch, obs)`; by default
             `drift_steps` and `drift_bias` beside the first observation.
