@@ -188,7 +188,10 @@ _ARGUMENTS = (
     "Tensor m0, Tensor network, int[] widths, bool residual, bool tanh"
 )
 _LIBRARY: Any = torch.library.Library("torchrl_drbpn", "DEF")  # type: ignore[no-untyped-call]
-_LIBRARY.define(f"filter_rows({_ARGUMENTS}) -> (Tensor, Tensor, Tensor)")
+# The second is the first without its derivative. (torch.library.register_autograd would make the
+# first alone do, at several times the cost of a call: it reads the schema in Python every time.)
+for _name in ("filter_rows", "filter_rows_forward"):
+    _LIBRARY.define(f"{_name}({_ARGUMENTS}) -> (Tensor, Tensor, Tensor)")
 _LIBRARY.define(
     "filter_rows_backward(Tensor? by_mean, Tensor? by_log_likelihood, Tensor tape, "
     f"{_ARGUMENTS}) -> Tensor[]"
@@ -352,13 +355,6 @@ def _backward_fake(*arguments: Any) -> list[Tensor]:
     return [torch.empty_like(v) for v in (x, action, stored, start, *model) if v is not None]
 
 
-def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    ctx.rest = inputs[15:]
-    ctx.save_for_backward(output[2], *inputs[:15])
-    ctx.mark_non_differentiable(output[2])
-    ctx.set_materialize_grads(False)
-
-
 def register_gradient(pytorch_form: Callable[..., tuple[Tensor, Tensor]]) -> None:
     """Register the operator's derivative; one that is differentiated again runs in PyTorch.
 
@@ -371,6 +367,22 @@ def register_gradient(pytorch_form: Callable[..., tuple[Tensor, Tensor]]) -> Non
         >>> hasattr(torch.ops.torchrl_drbpn, "filter_rows")
         True
     """
+
+    class Filter(torch.autograd.Function):
+        @staticmethod
+        def forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+            return torch.ops.torchrl_drbpn.filter_rows_forward(*arguments)
+
+        @staticmethod
+        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+            ctx.rest = inputs[15:]
+            ctx.save_for_backward(output[2], *inputs[:15])
+            ctx.mark_non_differentiable(output[2])
+            ctx.set_materialize_grads(False)
+
+        @staticmethod
+        def backward(ctx: Any, *by_outputs: Tensor | None) -> tuple[Any, ...]:
+            return gradient(ctx, *by_outputs)
 
     def gradient(ctx: Any, *by_outputs: Tensor | None) -> tuple[Any, ...]:
         tape, *saved = ctx.saved_tensors
@@ -400,9 +412,7 @@ def register_gradient(pytorch_form: Callable[..., tuple[Tensor, Tensor]]) -> Non
         known = {id(x): g for x, g in zip(wanted, found, strict=True)}
         return *(known.get(id(x)) for x in saved), None, None, None
 
-    torch.library.register_autograd(
-        "torchrl_drbpn::filter_rows", gradient, setup_context=_setup_context, lib=_LIBRARY
-    )
+    _LIBRARY.impl("filter_rows", Filter.apply, "Autograd")
 
 
 def _unpacked(
@@ -430,8 +440,9 @@ def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor
     return tuple(torch.stack(parts) for parts in zip(*runs, strict=True)), (0, 0, 0)
 
 
-_LIBRARY.impl("filter_rows", _forward, "CPU")
+for _name in ("filter_rows", "filter_rows_forward"):
+    _LIBRARY.impl(_name, _forward, "CPU")
+    torch.library.register_fake(f"torchrl_drbpn::{_name}", _forward_fake, lib=_LIBRARY)
 _LIBRARY.impl("filter_rows_backward", _backward, "CPU")
-torch.library.register_fake("torchrl_drbpn::filter_rows", _forward_fake, lib=_LIBRARY)
 torch.library.register_fake("torchrl_drbpn::filter_rows_backward", _backward_fake, lib=_LIBRARY)
 torch.library.register_vmap("torchrl_drbpn::filter_rows", _vmap, lib=_LIBRARY)
