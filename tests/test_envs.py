@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from env_tools import BACKENDS, TASKS, play, random_actions
-from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv, check_env_specs
 from torchrl.testing import rollout_consistency_assertion
 
@@ -187,20 +186,6 @@ def test_a_step_never_writes_into_what_an_earlier_one_returned(backend):
         env.step(root.clone())
     env.reset()
     assert (first == kept).all()
-
-
-def test_a_collector_fills_whole_batches(backend):
-    env = backend("InvertedPendulum-v5", 4, seed=0)
-    collector = Collector(
-        env, None, frames_per_batch=80, total_frames=160, auto_register_policy_transforms=True
-    )
-    batches = [batch.clone() for batch in collector]
-    assert [batch.shape for batch in batches] == [(4, 20), (4, 20)]
-    done = batches[0]["next", "done"][:, :-1, 0]
-    assert done.any()
-    same = (batches[0]["next", "observation"][:, :-1] == batches[0]["observation"][:, 1:]).all(-1)
-    assert torch.equal(same, ~done)
-    collector.shutdown()
 
 
 def test_it_works_as_a_worker_of_a_serial_environment(backend):

@@ -95,13 +95,10 @@ def test_with_fewer_than_two_values_the_spread_is_one(seen):
     assert spread(masked_moments(value, observed), EPS).item() == 1.0
 
 
-@pytest.mark.parametrize(
-    ("mask", "error"), [(torch.ones(4, 2), TypeError), (torch.ones(4).bool(), ValueError)]
-)
-def test_a_mask_of_wrong_dtype_or_shape_is_refused(mask, error):
-    for call in (masked_moments, lambda x, m: winsorize(x, m, nothing(2), EPS)):
-        with pytest.raises(error, match="`observed` must"):
-            call(torch.zeros(4, 2), mask)
+@pytest.mark.parametrize("mask", [torch.ones(4, 2), torch.ones(4).bool()], ids=["dtype", "shape"])
+def test_a_mask_of_wrong_dtype_or_shape_is_refused(mask):
+    with pytest.raises(ValueError, match="`observed` must be bool of the shape"):
+        masked_moments(torch.zeros(4, 2), mask)
 
 
 def test_moments_of_other_sensors_are_not_merged():

@@ -173,7 +173,8 @@ def test_a_seeded_partial_reset_gives_the_rows_what_a_whole_one_does():
     assert torch.equal(again["observation"][::2], later["observation"][::2])
 
 
-def test_making_writes_no_log_file_and_says_each_model_warning_once(tmp_path, caplog):
+def test_making_writes_no_log_file_and_logs_each_model_warning_once(tmp_path, caplog, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with caplog.at_level("INFO"):
         GymnasiumBatchEnv("HalfCheetah-v5", 3)
     assert not any(tmp_path.iterdir())

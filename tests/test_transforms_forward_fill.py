@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 
-from torchrl_drbpn.transforms import FillLastObserved, ObservationMissingness, SensorReduction
+from torchrl_drbpn.transforms import FillLastObserved, ObservationMissingness
 
 
 def masked(env, eta=0.5, seed=0):
@@ -92,26 +92,6 @@ def test_an_environment_that_resets_itself_starts_from_the_fill_value():
     assert data["next", "done"].sum() > 6
     # such an environment overwrites the last observation of an episode: look at the roots alone
     assert torch.equal(data["observation"], filled_by_hand(data, -7.0))
-
-
-def test_the_mask_stays_as_it_is():
-    plain = masked(TransformedEnv(StaircaseEnv(), Compose()), seed=5)
-    filled = masked(TransformedEnv(StaircaseEnv(), Compose()), seed=5)
-    filled = filled.append_transform(FillLastObserved())
-    torch.manual_seed(0)
-    expected = plain.rollout(6, break_when_any_done=False)
-    received = filled.rollout(6, break_when_any_done=False)
-    assert torch.equal(received["observed"], expected["observed"])
-    assert not received["observed"].all()
-
-
-def test_a_component_that_never_arrives_keeps_the_fill_value():
-    env = TransformedEnv(
-        StaircaseEnv(), Compose(SensorReduction([1]), FillLastObserved(fill_value=2.5))
-    )
-    data = env.rollout(6, break_when_any_done=False)
-    assert (data["observation"][..., 1] == 2.5).all()
-    assert torch.equal(data["observation"][0, 0, [0, 2]], torch.tensor([0.0, 0.2]))
 
 
 def test_with_other_out_keys_the_observation_stays_as_it_was():

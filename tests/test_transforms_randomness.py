@@ -41,10 +41,6 @@ def data(value=1.0, batch=(4,), **more):
     return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
-def masks_of(env, steps=8):
-    return env.rollout(steps, break_when_any_done=False)["observed"]
-
-
 # ---------------------------------------------------------------------------------- without a seed
 def corrupted_gym(**kwargs):
     return gym_env().append_transform(
@@ -181,19 +177,6 @@ def test_a_seed_always_stands_for_the_same_numbers(make, stream, draw):
         assert torch.equal(received, draw(data()["observation"], generator))
 
 
-def test_one_seed_is_one_sequence_of_masks():
-    def of(seed):
-        return masks_of(staircase(ObservationMissingness("mcar", 0.5, seed=seed)))
-
-    assert torch.equal(of(3), of(3))
-    assert not torch.equal(of(3), of(4))
-    assert not torch.equal(of(3)[:, 0], of(3)[:, 1])
-    env = staircase(ObservationMissingness("mcar", 0.5, seed=3))
-    first = masks_of(env)
-    env.transform[0].set_seed(3)
-    assert torch.equal(masks_of(env), first)
-
-
 def test_classes_with_the_same_seed_are_unrelated():
     zeros = TensorDict({"observation": torch.zeros(8000, OBS)}, [8000])
     drawn = [
@@ -221,13 +204,6 @@ def test_data_on_a_gpu_stays_there_with_the_same_mechanism(mechanism, seed):
     if mechanism != "mcar":
         on_gpu = [part.cpu() for part in there.mechanism_parameters]
         assert all(map(torch.equal, here.mechanism_parameters, on_gpu))
-
-
-@pytest.mark.parametrize("mechanism", KINDS)
-def test_the_first_observation_of_an_episode_is_corrupted_too(mechanism):
-    env = staircase(ObservationMissingness(mechanism, 0.9), batch=50)
-    observed = env.reset()["observed"]
-    assert 0.2 < 1 - observed.double().mean() < 1
 
 
 @pytest.mark.parametrize("mechanism", ["mar", "nmar"])

@@ -127,6 +127,7 @@ def filled(before: TensorDictBase, after: TensorDictBase) -> None:
     values, observed = after["observation"], after["observed"]
     assert torch.equal(values, after["last_observation"])
     if "observation" in before:
+        assert torch.equal(observed, before["observed"])
         assert torch.equal(values[observed], before["observation"][observed])
 
 

@@ -1,4 +1,4 @@
-"""What MuJoCo warns of: models with faults, and states that it gives up in the middle of a run."""
+"""Warnings of MuJoCo: about model files, and about states that it gives up during a run."""
 
 from __future__ import annotations
 
@@ -15,16 +15,10 @@ _log = logging.getLogger(__name__)
 
 
 def bad_state_counters(env: gymnasium.Env[Any, Any]) -> MutableSequence[int]:
-    """Return MuJoCo's own counters of states that it gave up since the last reset.
+    """Return a view on MuJoCo's counters of states that it gave up; empty for other environments.
 
     MuJoCo resets itself where positions, velocities or accelerations are huge or NaN, and drops
-    controls that are NaN; the simulation then goes on from a state that nobody asked for.
-
-    Args:
-        env: an environment, wrapped or not.
-
-    Returns:
-        A view on the counters; empty where the environment is not MuJoCo's.
+    controls that are NaN.
 
     Examples:
         >>> env = gymnasium.make("InvertedPendulum-v5")
@@ -44,7 +38,7 @@ def bad_state_counters(env: gymnasium.Env[Any, Any]) -> MutableSequence[int]:
         return []
     if not isinstance(data, mujoco.MjData):
         return []
-    # The four of interest are the last ones; memoryviews are read ten times faster than arrays.
+    # The four of interest are the last ones; a memoryview is read ten times faster than an array.
     first = int(mujoco.mjtWarning.mjWARN_BADQPOS)
     counters: Any = memoryview(data.warning.number[first:])
     return counters

@@ -43,23 +43,18 @@ class EnvPoolBatchEnv(SimulatorBatch):
     - Resets of MuJoCo by itself can not be seen: :attr:`engine_resets` stays 0.
 
     Raises:
-        ModuleNotFoundError: where EnvPool is not installed.
-        ValueError: where the id is unknown, the observation is not a vector, the action is not a
-            vector of bounded numbers, or a number is out of range.
-        TypeError: where ``dtype`` is not ``torch.float32`` or ``torch.float64``.
+        ModuleNotFoundError: if EnvPool is not installed; else as ``GymnasiumBatchEnv``.
 
     Examples:
         >>> env = EnvPoolBatchEnv("InvertedPendulum-v5", 3, seed=0)
-        >>> rollout = env.rollout(20, break_when_any_done=False)
-        >>> rollout["next", "reward"].shape
-        torch.Size([3, 20, 1])
-        >>> again = env.reset(seed=0)
-        >>> bool((again["observation"] == rollout["observation"][:, 0]).all())
+        >>> bool((env.reset(seed=0)["observation"] == env.reset(seed=0)["observation"]).all())
         True
     """
 
-    def _build(self) -> tuple[Any, Any, int | None]:
+    def _build(self) -> tuple[Any, Any, int | None, int | None]:
         """Look up the sizes; the simulators are made at the first reset, when seeds are known."""
+        if self.make_kwargs:
+            raise TypeError(f"`EnvPoolBatchEnv` takes no {sorted(self.make_kwargs)}.")
         try:
             import envpool
         except ModuleNotFoundError as error:
@@ -85,7 +80,7 @@ class EnvPoolBatchEnv(SimulatorBatch):
         if isinstance(action, gymnasium.spaces.Box):  # of float64 in EnvPool
             low, high = action.low.astype(np.float32), action.high.astype(np.float32)
             action = gymnasium.spaces.Box(low, high)
-        return spec.gymnasium_observation_space, action, int(spec.config.max_episode_steps)
+        return spec.gymnasium_observation_space, action, int(spec.config.max_episode_steps), None
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)

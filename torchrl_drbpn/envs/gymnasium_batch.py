@@ -62,9 +62,9 @@ class GymnasiumBatchEnv(SimulatorBatch):
         **make_kwargs: passed to ``gymnasium.make``, for example ``render_mode="rgb_array"``.
 
     Raises:
-        ValueError: where the id is unknown, the observation is not a vector, the action is not a
+        ValueError: if the id is unknown, the observation is not a vector, the action is not a
             vector of bounded numbers, or a number is out of range.
-        TypeError: where ``dtype`` is not ``torch.float32`` or ``torch.float64``.
+        TypeError: if ``dtype`` is not ``torch.float32`` or ``torch.float64``.
 
     Examples:
         >>> env = GymnasiumBatchEnv("InvertedPendulum-v5", 3, seed=0)
@@ -76,36 +76,9 @@ class GymnasiumBatchEnv(SimulatorBatch):
         True
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        num_envs: int,
-        *,
-        seed: int | None = None,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
-        max_episode_steps: int | None = None,
-        num_threads: int = 1,
-        **make_kwargs: Any,
-    ) -> None:
-        self.make_kwargs = make_kwargs
-        super().__init__(
-            env_id,
-            num_envs,
-            seed=seed,
-            device=device,
-            dtype=dtype,
-            max_episode_steps=max_episode_steps,
-            num_threads=num_threads,
-        )
-        own = self.envs[0].spec
-        if own is not None and own.max_episode_steps is not None:  # a TimeLimit inside the task
-            limits = (own.max_episode_steps, self.max_episode_steps)
-            self.max_episode_steps = min(x for x in limits if x is not None)
-
     # Stepping -------------------------------------------------------------------------------
 
-    def _build(self) -> tuple[Any, Any, int | None]:
+    def _build(self) -> tuple[Any, Any, int | None, int | None]:
         """Make the environments, without the outermost time limit, which the batch keeps."""
         module, _, name = self.env_id.rpartition(":")
         try:
@@ -125,7 +98,9 @@ class GymnasiumBatchEnv(SimulatorBatch):
         share = -(-self.num_envs // self.num_threads)
         starts = range(0, self.num_envs, share)
         self._shares = [range(i, min(i + share, self.num_envs)) for i in starts]
-        return self.envs[0].observation_space, self.envs[0].action_space, limit
+        env = self.envs[0]
+        own = None if env.spec is None else env.spec.max_episode_steps  # a TimeLimit in the task
+        return env.observation_space, env.action_space, limit, own
 
     def _make(self, name: str) -> gymnasium.Env[Any, Any]:
         env = gymnasium.make(
@@ -204,7 +179,7 @@ class GymnasiumBatchEnv(SimulatorBatch):
 
     @property
     def supports_state(self) -> bool:
-        """Tell whether the whole state can be saved: True for plain MuJoCo environments."""
+        """Whether the whole state can be saved: True for plain MuJoCo environments."""
         return all(is_mujoco(env) for env in self.envs)
 
     def _rows_state(self) -> dict[str, NDArray[Any]]:
@@ -212,10 +187,7 @@ class GymnasiumBatchEnv(SimulatorBatch):
         return {name: getattr(self, f"_{name}") for name in names}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the whole state as tensors: simulators, generators, clocks and pending seeds.
-
-        ``state_dict()`` calls it. Everything is a tensor, so that ``torch.load`` reads it back
-        with ``weights_only=True``.
+        """Return the whole state as tensors, which ``torch.load(weights_only=True)`` reads.
 
         Returns:
             ``simulators`` (see ``simulator_state``), ``elapsed`` int64 ``(num_envs,)`` steps since
@@ -229,15 +201,7 @@ class GymnasiumBatchEnv(SimulatorBatch):
         return {"simulators": save_state(self.envs), **rows}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that :meth:`get_extra_state` returned; ``load_state_dict`` calls it.
-
-        Args:
-            state: the tensors that :meth:`get_extra_state` returned.
-
-        Raises:
-            ValueError: where the state is of another task or number of environments, or incomplete.
-            RuntimeError: for a state where :attr:`supports_state` is False.
-        """
+        """Go on from a state that :meth:`get_extra_state` returned; see the base class."""
         if not self.supports_state:
             super().set_extra_state(state)
             return
@@ -263,7 +227,7 @@ class GymnasiumBatchEnv(SimulatorBatch):
         return state | {"_saved": self.get_extra_state()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make the simulators again and put them where they were, if their state was saved."""
+        """Make the simulators again, in the state that was saved, if any."""
         saved = state.pop("_saved")
         super().__setstate__(state)
         self._build()

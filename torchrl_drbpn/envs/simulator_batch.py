@@ -23,7 +23,7 @@ NO_SEED = -1
 
 
 class SimulatorError(RuntimeError):
-    """Report a simulator that raised, or whose reward is not finite: which one, and when."""
+    """A simulator raised, or returned a reward that is not finite; says which one, and when."""
 
 
 class SimulatorBatch(EnvBase):
@@ -44,6 +44,7 @@ class SimulatorBatch(EnvBase):
         dtype: torch.dtype = torch.float32,
         max_episode_steps: int | None = None,
         num_threads: int = 1,
+        **make_kwargs: Any,
     ) -> None:
         counts = {"num_envs": num_envs, "num_threads": num_threads}
         if max_episode_steps not in (None, -1):
@@ -55,10 +56,11 @@ class SimulatorBatch(EnvBase):
             raise TypeError(f"`dtype` must be torch.float32 or torch.float64, got {dtype}.")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.env_id, self.num_envs, self.dtype = env_id, num_envs, dtype
-        self.num_threads = min(num_threads, num_envs)
-        observation_space, action_space, registered = self._build()
+        self.num_threads, self.make_kwargs = min(num_threads, num_envs), make_kwargs
+        observation_space, action_space, registered, own = self._build()
         limit = registered if max_episode_steps is None else max_episode_steps
-        self.max_episode_steps = None if limit == -1 else limit
+        limits = [steps for steps in (limit, own) if steps not in (None, -1)]
+        self.max_episode_steps = min(limits, default=None)
         self._make_specs(observation_space, action_space)
         self.is_closed = False
         self._observation = np.zeros((num_envs, *observation_space.shape))
@@ -70,8 +72,8 @@ class SimulatorBatch(EnvBase):
             self.set_seed(seed)
 
     @abstractmethod
-    def _build(self) -> tuple[Any, Any, int | None]:
-        """Make the simulators; return observation space, action space, registered time limit."""
+    def _build(self) -> tuple[Any, Any, int | None, int | None]:
+        """Make the simulators; return both spaces, the registered and the task's own time limit."""
 
     @abstractmethod
     def _advance(
@@ -220,11 +222,8 @@ class SimulatorBatch(EnvBase):
 
     @property
     def supports_state(self) -> bool:
-        """Tell whether the whole state can be saved; where it is False ``state_dict()`` is empty.
-
-        It is empty rather than an error because TorchRL asks a shadow of every environment of a
-        ``ParallelEnv`` for its state.
-        """
+        """Whether the whole state can be saved; where it is False ``state_dict()`` is empty."""
+        # not an error: TorchRL asks a shadow of every environment of a ParallelEnv for its state
         return False
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -238,7 +237,7 @@ class SimulatorBatch(EnvBase):
             state: what an environment like this one saved.
 
         Raises:
-            ValueError: where the state is of another task or number of environments, or incomplete.
+            ValueError: if the state is of another task or number of environments, or incomplete.
             RuntimeError: for a state where :attr:`supports_state` is False.
         """
         if state:
@@ -251,10 +250,7 @@ class SimulatorBatch(EnvBase):
         """Close the simulators, their renderers and the threads.
 
         Args:
-            raise_if_closed: raise where the environment was closed before.
-
-        Raises:
-            RuntimeError: where it was closed before, unless ``raise_if_closed`` is False.
+            raise_if_closed: raise a RuntimeError if the environment was closed before.
         """
         if self.is_closed and raise_if_closed:
             raise RuntimeError("trying to close a closed environment")
@@ -271,12 +267,5 @@ class SimulatorBatch(EnvBase):
 
 
 def one_line(thing: object) -> str:
-    """Return the text of an object on one line.
-
-    Args:
-        thing: what to print.
-
-    Returns:
-        Its text, every run of white space one blank.
-    """
+    """Return the text of an object on one line."""
     return " ".join(str(thing).split())

@@ -33,18 +33,7 @@ _DERIVED = (
 
 
 def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:
-    """Tell whether ``env`` is a plain MuJoCo environment of Gymnasium, without wrappers.
-
-    Args:
-        env: the environment.
-
-    Returns:
-        True where its whole state can be saved.
-
-    Examples:
-        >>> is_mujoco(gymnasium.make("Swimmer-v5").unwrapped)
-        True
-    """
+    """Return whether ``env`` is a plain MuJoCo environment of Gymnasium, without wrappers."""
     if env.unwrapped is not env:
         return False
     from gymnasium.envs.mujoco import MujocoEnv  # imports mujoco, which not every task needs
@@ -53,15 +42,11 @@ def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:
 
 
 def save_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
-    """Return the whole state of MuJoCo environments as tensors.
+    """Return the whole state of MuJoCo environments of one task as tensors.
 
-    Args:
-        envs: MuJoCo environments of one task, without wrappers.
-
-    Returns:
-        ``physics`` float64 ``(num_envs, size)``, the integration state; ``derived`` float64
-        ``(num_envs, size)``; ``generators`` uint8 ``(bytes,)``, JSON with one entry an environment:
-        its random generator (whose integers have 128 bits) and its plain numbers.
+    ``physics`` float64 ``(num_envs, size)`` is the integration state, ``derived`` float64
+    ``(num_envs, size)``, ``generators`` uint8 ``(bytes,)`` is JSON with one entry an environment:
+    its random generator (whose integers have 128 bits) and its plain numbers.
     """
     import mujoco
 
@@ -81,14 +66,7 @@ def save_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
 
 
 def load_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) -> None:
-    """Put MuJoCo environments into a state that :func:`save_state` returned.
-
-    Args:
-        envs: MuJoCo environments of the same task, without wrappers.
-        state: the tensors that :func:`save_state` returned.
-
-    Raises:
-        ValueError: where the state is of another task or incomplete.
+    """Put environments into a state of :func:`save_state`; a ValueError if it does not fit.
 
     Examples:
         >>> env = gymnasium.make("Hopper-v5").unwrapped
@@ -141,7 +119,7 @@ def _derived(data: Any) -> list[Any]:
 
 
 def _numbers(env: Any) -> dict[str, tuple[Any, str | None]]:
-    """Collect the numbers and arrays among an environment's attributes (Reacher's goal, say)."""
+    """Collect the numbers and arrays among an environment's attributes, as Reacher's goal."""
     found: dict[str, tuple[Any, str | None]] = {}
     for name, value in vars(env).items():
         if isinstance(value, np.ndarray | np.generic):

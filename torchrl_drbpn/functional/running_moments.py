@@ -2,8 +2,8 @@
 
 Only entries that were observed count, so every component has a count of its own. Batches are merged
 by the pairwise rule of Chan, Golub and LeVeque, which loses no precision where the mean is large
-beside the spread and gives the same result in whatever order the batches arrive. A reading that is
-far from everything else is moved to a bound before it is learned from.
+beside the spread and gives the same result in whatever order the batches come. Outliers are clipped
+before they are learned from.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ _FIRST_SHARE = 1000
 class RunningMoments(NamedTuple):
     """Hold how many values were seen, their mean and their variance.
 
-    The variance instead of the sum of squares: it does not grow with the count, so that it fits
-    into float32 however long the statistics run.
+    The variance, unlike the sum of squares, does not grow with the count: it fits into float32.
 
     Attributes:
         n: number of observed values of each component, shape ``(*event)``.
@@ -65,8 +64,7 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMome
         The moments, in float64; all 0 where nothing was observed.
 
     Raises:
-        TypeError: ``observed`` is not bool.
-        ValueError: ``observed`` has another shape than ``value``.
+        ValueError: if ``observed`` is not bool of the shape of ``value``.
 
     Example:
         >>> import torch
@@ -76,7 +74,11 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMome
     """
     if observed is None:
         observed = torch.ones_like(value, dtype=torch.bool)
-    _check_mask(value, observed)
+    if observed.dtype is not torch.bool or observed.shape != value.shape:
+        raise ValueError(
+            f"`observed` must be bool of the shape of `value` {tuple(value.shape)}, one entry for "
+            f"every component, got {observed.dtype} {tuple(observed.shape)}."
+        )
     weight = observed.double()
     count = weight.sum(0)
     share = weight / count.clamp_min(1.0)
@@ -132,9 +134,6 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
 def spread(moments: RunningMoments, eps: float) -> Tensor:
     r"""Return the standard deviation sqrt(var + eps), and 1 where fewer than two values were seen.
 
-    One value says nothing about a spread; 1 leaves such a component on its own scale instead of
-    blowing it up.
-
     Args:
         moments: moments of shape ``(*event)``.
         eps: added to the variance, squared units.
@@ -154,14 +153,13 @@ def spread(moments: RunningMoments, eps: float) -> Tensor:
 def winsorize(
     value: Tensor, observed: Tensor, learned: RunningMoments, eps: float
 ) -> tuple[Tensor, Tensor]:
-    r"""Move readings that are far from all others to a bound, so that one cannot undo the rest.
+    r"""Clip outliers to a bound, so that one reading cannot dominate the statistics.
 
-    A component of which 100 readings were learned, and whose variance is more than ``eps``, is
-    bounded by its learned mean plus and minus 10 learned deviations. A scale that really grows is
-    followed: the deviation can grow tenfold with each batch. Before that the batch bounds itself:
-    by its median plus and minus 5 times a deviation that only one in a thousand readings, and at
-    least one, exceeds. With fewer than three readings nothing is learned of such a component, as
-    none of them could be told from a wild one.
+    A component with 100 learned readings and a variance above ``eps`` is clipped to its learned
+    mean plus and minus 10 learned deviations: a scale that really grows can grow tenfold with each
+    batch. Before that the batch sets the bound: its median plus and minus 5 times a deviation that
+    only one in a thousand readings, and at least one, exceeds. Of fewer than three readings
+    nothing is learned, as an outlier among them could not be recognised.
 
     Args:
         value: readings, shape ``(samples, *event)``, finite where observed.
@@ -180,7 +178,6 @@ def winsorize(
         >>> bool(bounded.max() < 30)
         True
     """
-    _check_mask(value, observed)
     value = value.double().masked_fill(~observed, 0.0).clamp(-_LARGEST, _LARGEST)
     known = (learned.n >= _ENOUGH) & (learned.var > eps)
     centre, radius = learned.mean.double(), _WIDTH * learned.var.double().sqrt()
@@ -199,16 +196,3 @@ def winsorize(
 def _gather(value: Tensor, rank: Tensor) -> Tensor:
     """Return the values of the given ranks along the first dimension, 0 the smallest."""
     return value.sort(0).values.gather(0, rank.clamp_min(0)).nan_to_num(posinf=0.0)
-
-
-def _check_mask(value: Tensor, observed: Tensor) -> None:
-    if observed.dtype is not torch.bool:
-        raise TypeError(
-            f"`observed` must be bool, got {observed.dtype}. "
-            "Compare with what marks a missing entry, or call .bool()."
-        )
-    if observed.shape != value.shape:
-        raise ValueError(
-            f"`observed` must have the shape of `value` {tuple(value.shape)}, one entry for every "
-            f"component, got {tuple(observed.shape)}."
-        )

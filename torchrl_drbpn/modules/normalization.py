@@ -36,8 +36,8 @@ class MaskedObservationNorm(TensorDictModuleBase):
     the epochs on that rollout, since before them the policy would no longer be the one that acted.
     Until then it is the identity up to ``clip``.
 
-    One wild reading cannot undo a sensor: what is learned from is bounded in learned deviations,
-    see :func:`~torchrl_drbpn.functional.running_moments.winsorize`.
+    One wild reading does not spoil the statistics: outliers are clipped before they are learned
+    from, see :func:`~torchrl_drbpn.functional.running_moments.winsorize`.
 
     Args:
         obs_dim: components of an observation.
@@ -216,10 +216,9 @@ class MaskedObservationNorm(TensorDictModuleBase):
         value, observed = self._readings(tensordict)
         following = tensordict.get("next", None)
         if following is not None and self._observation_key in following.keys(True):
-            is_init = tensordict.get("is_init", None)
+            is_init, done = tensordict.get("is_init", None), following.get("done", None)
             if is_init is not None:
                 observed[..., 0, :] &= is_init.reshape(tensordict.shape)[..., :1]
-            done = following.get("done", None)
             last = torch.zeros(tensordict.shape, dtype=torch.bool, device=value.device)
             if done is not None:
                 last |= done.reshape(tensordict.shape)
@@ -265,16 +264,15 @@ class MaskedObservationNorm(TensorDictModuleBase):
             )
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | None]:
-        value = tensordict.get(self._observation_key, None)
-        mask_key = self._observed_key
-        observed = None if mask_key is None else tensordict.get(mask_key, None)
-        if value is None or (observed is None and mask_key is not None):
-            absent = self._observation_key if value is None else mask_key
-            raise KeyError(
-                f"`{absent}` is not in the tensordict. Name the entries by in_keys; "
-                "in_keys=[observation] alone says that everything arrives."
-            )
-        return value, observed
+        keys = [key for key in (self._observation_key, self._observed_key) if key is not None]
+        found = [tensordict.get(key, None) for key in keys]
+        for key, value in zip(keys, found, strict=True):
+            if value is None:
+                raise KeyError(
+                    f"`{key}` is not in the tensordict. Name the entries by in_keys; "
+                    "in_keys=[observation] alone means that everything arrives."
+                )
+        return found[0], found[1] if len(found) == 2 else None
 
 
 def _refuse_unusable(

@@ -25,12 +25,11 @@ class BeliefModelLoss(LossModule):
     its scale does not change with the missing rate (``normalize="step"`` is the paper's).
 
     It holds no network: a belief module has written ``("belief", "log_likelihood")`` before.
-    Steps count with their own observation. The steps of :meth:`last_steps` count with the next one
-    too if ``("next", "belief", "log_likelihood")`` is there (:class:`DRBPNLoss` writes it): no
-    other step holds it.
+    Every step counts with its own observation, and those of :meth:`last_steps` with the next one
+    too if ``("next", "belief", "log_likelihood")`` is there (:class:`DRBPNLoss` writes it).
 
-    Keys are named as in TorchRL's losses: the flags ``done`` and ``terminated`` are looked for
-    inside "next"; the next mask and the next likelihood are called what those of the step are.
+    As in TorchRL's losses ``done`` and ``terminated`` are read inside "next". The next mask and the
+    next likelihood have the names of the step's own.
 
     Keyword Args:
         normalize: "entry" divides by the number of observed entries, "step" by steps.
@@ -93,16 +92,7 @@ class BeliefModelLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_model`` and, detached, ``log_likelihood`` per observed entry (nats)."""
         keys = self.tensor_keys
-        ll, observed = (
-            tensordict.get(keys.log_likelihood, None),
-            tensordict.get(keys.observed, None),
-        )
-        if ll is None or observed is None:
-            absent = keys.log_likelihood if ll is None else keys.observed
-            raise KeyError(
-                f"`{absent}` is not in the tensordict: run the belief module on it first, under "
-                "set_recurrent_mode(True)."
-            )
+        ll, observed = self._read(tensordict, keys.log_likelihood, keys.observed)
         if observed.dtype is not torch.bool or observed.shape[:-1] != ll.shape:
             raise ValueError(
                 f"`{keys.observed}` must be bool of shape (*batch, obs) with *batch = "
@@ -112,13 +102,7 @@ class BeliefModelLoss(LossModule):
         steps, entries = torch.ones_like(ll), observed.sum(-1).to(ll.dtype)
         next_ll = tensordict.get(in_next(keys.log_likelihood), None)
         if next_ll is not None:
-            next_observed = tensordict.get(in_next(keys.observed), None)
-            if next_observed is None:
-                raise KeyError(
-                    f"`{in_next(keys.observed)}` is not in the tensordict although "
-                    f"`{in_next(keys.log_likelihood)}` is: the mask says how many entries it "
-                    "counts."
-                )
+            (next_observed,) = self._read(tensordict, in_next(keys.observed))
             last = self.last_steps(tensordict)
             ll = ll + torch.where(last, next_ll, 0.0)
             entries = entries + torch.where(last, next_observed.sum(-1), 0)
@@ -138,13 +122,12 @@ class BeliefModelLoss(LossModule):
         return TensorDict({"loss_model": value, "log_likelihood": per_entry.detach()})
 
     def last_steps(self, tensordict: TensorDictBase) -> Tensor:
-        """Tell the steps whose next observation is no other step's own.
+        """Return which steps have a next observation that is no other step's own.
 
-        Those that terminated, those that are ``final`` (the recipe cut its rollout there), and
-        those that are ``done``. A replay buffer of single steps is not believed that last one:
-        TorchRL's SliceSampler writes ``done`` where it cuts a slice, and the next observation is
-        another step's own there. Where it draws, mark the ends of episodes and rollouts as
-        ``final`` before they are stored.
+        Those that terminated, that are ``final`` (the rollout was cut there), or that are ``done``.
+        In data of a replay buffer of single steps ``done`` alone does not count: TorchRL's
+        SliceSampler writes it where it cuts a slice. Mark the ends of episodes and rollouts as
+        ``final`` before such data are stored.
 
         Args:
             tensordict: rollout data, batch size ``(*batch, time)``.
@@ -172,6 +155,16 @@ class BeliefModelLoss(LossModule):
                 done = done & ~moves.any(-1).any(-1, keepdim=True)
             last = last | done
         return last
+
+    def _read(self, tensordict: TensorDictBase, *keys: NestedKey) -> list[Tensor]:
+        found = [tensordict.get(key, None) for key in keys]
+        for key, value in zip(keys, found, strict=True):
+            if value is None:
+                raise KeyError(
+                    f"`{key}` is not in the tensordict: run the belief module on it first, under "
+                    "set_recurrent_mode(True)."
+                )
+        return found
 
     def _valid(self, tensordict: TensorDictBase, shape: torch.Size) -> list[Tensor]:
         """Return the masks that TorchRL marks padded or cut steps with, as its own losses do."""

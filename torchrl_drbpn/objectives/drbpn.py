@@ -51,13 +51,12 @@ class DRBPNLoss(LossModule):
     module writes (``features``). ``loss_model`` comes out weighted by ``model_coeff``, as
     ``loss_critic`` does by its coefficient, so the sum of all ``loss_*`` is the total.
 
-    The input is a batch of sequences, ``[*batch, time]``, cut from rollouts, with the stored
-    recurrent state: each sequence starts from the belief the collector stored there. Where no other
-    step holds the next observation (:meth:`BeliefModelLoss.last_steps`), its likelihood is added by
-    one more step of the belief module.
+    The input is a batch of sequences, ``[*batch, time]``, cut from rollouts, with the recurrent
+    state that the collector stored. Where no other step holds the next observation
+    (:meth:`BeliefModelLoss.last_steps`), one more step of the belief module adds its likelihood.
 
     Keys and coefficients are those of the held losses, set here or there. ``actor_network`` and
-    ``critic_network`` are whole: the belief module, then the head.
+    ``critic_network`` are the belief module followed by the head.
 
     Args:
         filter_module: a belief module, such as :class:`~torchrl_drbpn.BeliefFilterModule`.
@@ -146,7 +145,7 @@ class DRBPNLoss(LossModule):
     # ------------------------------------------------------------------ keys
     @property
     def tensor_keys(self) -> _AcceptedKeys:
-        """The entries read; those of a held loss are what they are called there."""
+        """The entries read, by the names that they have in the held losses."""
         keys = self._own_keys
         for part in (self.model_loss, self.ppo_loss):
             for name, key in vars(part.tensor_keys).items() if part is not None else ():
@@ -179,7 +178,7 @@ class DRBPNLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Entries read: the belief module's, its next step's, the heads' own, those of PPO."""
-        # Of the held losses: `dispatch` asks for the in_keys while it is compiled.
+        # The held loss's own keys, not `tensor_keys`: `dispatch` reads in_keys while it compiles.
         keys, belief = self.ppo_loss.tensor_keys, list(self.filter_network.in_keys)
         actor, critic = self.ppo_loss.actor_network, self.ppo_loss.critic_network
         heads = [*actor.in_keys, *([] if critic is None else critic.in_keys)]
@@ -189,15 +188,10 @@ class DRBPNLoss(LossModule):
             made = in_next(self.model_loss.tensor_keys.log_likelihood)
             model = [key for key in self.model_loss.in_keys if key != made]
         own = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target)
-        read = [
-            *belief,
-            *(in_next(key) for key in belief),
-            # A head may read more than features, as a critic that sees what the actor does not.
-            *heads,
-            *model,
-        ]
-        read = [key for key in map(unravel_key, read) if key not in written]
-        return list(dict.fromkeys([*read, *map(unravel_key, own)]))
+        # A head may read more than features, as a critic that sees what the actor does not.
+        read = (*belief, *map(in_next, belief), *heads, *model)
+        given = [key for key in map(unravel_key, read) if key not in written]
+        return list(dict.fromkeys([*given, *map(unravel_key, own)]))
 
     @property
     def out_keys(self) -> list[NestedKey]:
@@ -257,7 +251,7 @@ class DRBPNLoss(LossModule):
         Returns:
             The loss.
         """
-        value_type = self.default_value_estimator if value_type is None else value_type
+        value_type = value_type or self.default_value_estimator
         if not isinstance(value_type, ValueEstimators):
             super().make_value_estimator(value_type, **hyperparams)
             return self
@@ -305,9 +299,8 @@ class DRBPNLoss(LossModule):
     def _add_last_observations(self, data: TensorDictBase, model_loss: BeliefModelLoss) -> None:
         """Write the likelihood of the next observation where no other step holds it.
 
-        Only those few steps are gathered: a pass over all of them would factorise twice as many
-        matrices as the filter itself. Their number depends on the data, so that a compiled loss
-        without breaks passes over all of them.
+        Only those few steps are gathered, as a pass over all of them would cost as much as the
+        filter itself; their number depends on the data, so that a compiled loss takes all.
         """
         keys, following = model_loss.tensor_keys, data.get("next", None)
         if following is None or following.get(keys.observed, None) is None:
@@ -320,7 +313,7 @@ class DRBPNLoss(LossModule):
         if not len(index):
             return  # not every belief module takes an empty batch
         belief_keys = self.filter_network.in_keys
-        # As sequences of one step, of a belief that goes on.
+        # sequences of one step that continue their episode
         steps = following.select(*belief_keys, strict=False).reshape(-1)[index].unsqueeze(1)
         goes_on = torch.zeros(*steps.shape, 1, dtype=torch.bool, device=last.device)
         steps.set(self._own_keys.is_init, goes_on)
