@@ -35,6 +35,8 @@ def test_every_choice_of_every_group_composes_and_passes_the_checks(group: str, 
 @pytest.mark.parametrize(
     "words",
     [("belief=fill", "missingness=nmar"), ("missingness=outages", "missingness.group_by=kind"),
+     ("missingness=delay", "noise=stuck", "noise.group_by=joint"), ("experiment=sensor_faults",),
+     ("missingness=multi_rate", "missingness.group_by=kind", "noise=drift"),
      ("noise=spikes", "heads.critic_input=complete"), ("env=gym", "env.id=Pendulum-v1"),
      ("env=hopper", "+env.kwargs.terminate_when_unhealthy=false")],
     ids=" ".join,
@@ -119,6 +121,11 @@ def test_what_can_not_be_composed_is_one_line(word: str, line: str) -> None:
     ("words", "line"),
     [
         (["missingness.eta=1.5"], "`missingness`: `eta` must be"),
+        (["missingness=delay", "missingness.delay=-1"], "`missingness`: `delay` must be a whole"),
+        (["missingness=delay", "missingness.delay=1000"], "`missingness.delay` must be shorter"),
+        (["missingness=multi_rate", "missingness.period=0"], "`missingness`: `period` must be"),
+        (["noise=stuck", "noise.stuck_probability=2"], "`noise`: `probability` must be"),
+        (["noise=drift", "noise.drift_std=-1"], "`noise`: `walk_std` must be"),
         (["missingness.eta=nan", "missingness=mcar"], "`missingness.eta` must be a finite number"),
         (["belief.state_dim=0"], "`belief`: `state_dim` must be an int of at least 1, got 0"),
         (["belief.policy_input=guess"], "`belief`: `policy_input` must be 'mean' or 'mean_cov'"),
@@ -143,9 +150,10 @@ def test_what_can_not_be_built_is_one_line(words: list[str], line: str) -> None:
 
 
 def test_missingness_has_one_name_that_reads_back() -> None:
-    names = [missingness_name(make_config(f"missingness={n}").missingness)
-             for n in ("none", "mcar", "mar", "nmar", "outages")]  # fmt: skip
-    assert names == ["none:0", "mcar:0.5", "mar:0.5", "nmar:0.5", "outages:0.5:20:sensor"]
+    kinds = ("none", "mcar", "mar", "nmar", "outages", "delay", "multi_rate")
+    names = [missingness_name(make_config(f"missingness={n}").missingness) for n in kinds]
+    assert names == ["none:0", "mcar:0.5", "mar:0.5", "nmar:0.5", "outages:0.5:20:sensor",
+                     "delay:2", "multi_rate:4:sensor"]  # fmt: skip
     assert missingness_name(choice("missingness", "mcar", eta=0.2)) == "mcar:0.2"
     with pytest.raises(UserError, match="`missingness=mcar` has no `mean_length`"):
         choice("missingness", "mcar", mean_length=3)

@@ -78,6 +78,15 @@ def settings() -> DictConfig:
         ("noise:2", "noise:2"),
         ("spikes:0.05", "spikes:0.05:5"),
         ("spikes:0.05:2", "spikes:0.05:2"),
+        ("stuck:.05", "stuck:0.05:20:sensor"),
+        ("stuck:0.05:5:joint", "stuck:0.05:5:joint"),
+        ("drift:0.02", "drift:0.02:0"),
+        ("drift:0:-0.1", "drift:0:-0.1"),
+        ("delay:2", "delay:2"),
+        ("delay:0:3", "delay:0:3:sensor"),
+        ("delay:1:3:kind:in_order", "delay:1:3:kind:in_order"),
+        ("multi_rate:4", "multi_rate:4:sensor"),
+        ("multi_rate:4:joint:0", "multi_rate:4:joint:0"),
     ],
 )
 def test_the_full_name_of_a_condition_reads_back_to_it(
@@ -89,9 +98,9 @@ def test_the_full_name_of_a_condition_reads_back_to_it(
 
 
 def test_a_condition_leaves_what_it_does_not_name_as_in_training(settings: DictConfig) -> None:
-    for text in ("noise:3", "spikes:0.1"):
+    for text in ("noise:3", "spikes:0.1", "stuck:0.1", "drift:1"):
         assert parse(text, settings).missingness == settings.missingness
-    for text in ("mar:0.5", "outages:0.5:20", "reduction:0.5:random"):
+    for text in ("mar:0.5", "outages:0.5:20", "delay:1", "multi_rate:2", "reduction:0.5:random"):
         assert parse(text, settings).noise == settings.noise
     spiked = parse("spikes:0.1:7", settings).noise
     assert spiked == {**settings.noise, "spike_probability": 0.1, "spike_std": 7.0}
@@ -101,7 +110,8 @@ def test_a_condition_leaves_what_it_does_not_name_as_in_training(settings: DictC
     "text",
     ["fog:0.5", "mcar", "mcar:x", "", "outages:0.5", "outages:0.5:20:leg", "reduction:0.5",
      "reduction:0.5:luck", "noise", "noise:-1", "spikes:1.5", "spikes:0.1:inf", "mcar:0.5:3",
-     "reduction:1.2:model", "mcar:1.5"],
+     "reduction:1.2:model", "mcar:1.5", "delay:-1", "delay:1.5", "delay:3:2", "delay:1:2:sensor:x",
+     "multi_rate:0", "multi_rate:2:sensor:2", "stuck:2", "stuck:0.1:0.5", "drift:-1", "drift:nan"],
 )  # fmt: skip
 def test_a_condition_that_can_not_be_read_is_refused(text: str, settings: DictConfig) -> None:
     with pytest.raises(UserError, match="`points` must hold trained or mechanism:eta") as error:
@@ -125,6 +135,10 @@ def test_the_default_conditions_are_those_of_the_paper_and_the_full_ones_go_beyo
     beyond += [f"outages:0.5:{length}:{by}" for by in groups for length in lengths]
     beyond += [f"noise:{sigma}" for sigma in (0, 1, 3, 10, 30)]
     beyond += [f"spikes:{probability}" for probability in (0.01, 0.05, 0.1, 0.2)]
+    beyond += [f"stuck:{probability}" for probability in (0.002, 0.01, 0.05)]
+    beyond += [f"drift:{std}" for std in (0.003, 0.01, 0.03)]
+    beyond += [f"delay:{steps}" for steps in (1, 2, 4)]
+    beyond += [f"multi_rate:{period}" for period in (2, 4, 8)]
     assert sorted(full) == sorted([*usual, *beyond])
     for text in full:
         parse(text, settings)
@@ -142,7 +156,8 @@ def test_mean_lengths_that_no_chain_has_are_left_out_and_refused(settings: DictC
 
 def test_each_family_changes_what_the_agent_gets(drbpn: Path, tmp_path: Path) -> None:
     texts = ("noise:0", "outages:0.5:3:kind", "reduction:0.5:random", "reduction:0.5:model")
-    points = ",".join(f"'{text}'" for text in (*texts, "spikes:1:5", "none:0", "mcar:1"))
+    late = ("delay:3", "multi_rate:4", "stuck:1:20", "drift:0:1")
+    points = ",".join(f"'{text}'" for text in (*texts, *late, "spikes:1:5", "none:0", "mcar:1"))
     rows = evaluate(
         tmp_path / "out.csv", drbpn, points=points, episodes=20, modes=["sampled"]
     )  # fmt: skip
@@ -158,6 +173,14 @@ def test_each_family_changes_what_the_agent_gets(drbpn: Path, tmp_path: Path) ->
     for by in ("random", "model"):  # 2 of 4 sensors
         assert mean(f"reduction:0.5:{by}", "missing_ratio") == pytest.approx(0.5)
     assert (mean("none:0", "missing_ratio"), mean("mcar:1", "missing_ratio")) == (0.0, 1.0)
+    assert mean("multi_rate:4:sensor", "missing_ratio") == pytest.approx(0.75, abs=0.06)
+    late_rows = frame["delay:3"]  # nothing in the first three steps, all of the rest
+    for row in late_rows:
+        assert float(row["missing_ratio"]) == pytest.approx(3 / int(row["length"]))
+    for wrong in ("stuck:1:20:sensor", "drift:0:1"):
+        assert mean(wrong, "missing_ratio") == pytest.approx(0.2, abs=0.06)
+    # What is stuck is easy to predict; what drifts is not.
+    assert mean("drift:0:1", "log_likelihood") < mean("noise:0", "log_likelihood")
     # A reading that is 5 off is not what the model expects.
     assert mean("spikes:1:5", "log_likelihood") < mean("noise:0", "log_likelihood")
 

@@ -28,6 +28,10 @@ _LEVELS = {
     "outages": "mean length of an outage, steps",
     "noise": "sigma of the noise",
     "spikes": "probability of a spike",
+    "delay": "least delay of a reading, steps",
+    "multi_rate": "steps from one reading to the next",
+    "stuck": "probability of getting stuck, a step",
+    "drift": "standard deviation of a step of the drift, raw units",
 }
 _TITLES = {"mcar": "MCAR", "mar": "MAR", "nmar": "NMAR"}
 

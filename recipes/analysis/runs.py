@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.stats import hmean
-from training.config import missingness_name
+from training.config import faults_name, missingness_name
 from training.errors import UserError
 from training.methods import method_name
 from training.run_folder import read_config
@@ -156,8 +156,7 @@ def _run(
 ) -> dict[str, Any]:
     frames = int(curve.frames.max()) if len(curve) else 0
     task, noise = config["env"]["id"], config["noise"]
-    spikes = noise.get("spike_probability", 0)
-    corruption = missingness_name(config["missingness"])
+    corruption = missingness_name(config["missingness"]) + faults_name(noise)
     early = curve[(curve.frames <= WITHIN) & (curve.episodes >= 100)]
     path = folder / "episodes.csv"
     episodes = read_table(path, ["frames", "return"]) if path.is_file() else curve.head(0)
@@ -170,7 +169,7 @@ def _run(
         "task": f"{task}-{config['env']['version']}",
         "method": method_name(config),
         "settings": "",
-        "trained_on": corruption + (f" spikes:{spikes:g}:{noise['spike_std']:g}" if spikes else ""),
+        "trained_on": corruption,
         "noise_sigma": float(noise["sigma"]),
         "seed": config["seed"],
         "frames": frames,

@@ -14,7 +14,10 @@ NOTHING_MISSING, TRAINING, ALL_TASKS = "none:0", "training", "all tasks"
 # By how much the paper's DRBPN is ahead of its DVRL at missing ratio .5.
 MARGINS_OVER_DVRL = {"Hopper": 0.20, "Walker2d": 0.75, "HalfCheetah": 1.00}
 _WHERE = ["trained_on", "noise_sigma", "settings", "point", "mode"]
-_KINDS = ("none", "mar", "mcar", "nmar", "outages", "reduction", "noise", "spikes")
+_KINDS = (
+    *("none", "mar", "mcar", "nmar", "outages", "delay", "multi_rate", "reduction"),
+    *("noise", "spikes", "stuck", "drift"),
+)
 
 
 def point_kind(point: str) -> tuple[str, float]:

@@ -92,6 +92,35 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
             if std is not None:
                 spiked = _with(noise, spike_probability=p, spike_std=std)
                 return Condition(f"spikes:{p:g}:{std:g}", "spikes", missing, spiked)
+        case ["stuck", share, *rest] if (p := _number(share, 1.0)) is not None and len(rest) < 3:
+            length, by = _number(rest[0]) if rest else 20.0, rest[1] if rest[1:] else "sensor"
+            if length is not None and length >= 1 and by in GROUPINGS:
+                stuck = {"stuck_probability": p, "stuck_mean_length": length, "group_by": by}
+                frozen = _with(noise, **stuck, id="${env.id}", version="${env.version}")
+                return Condition(f"stuck:{p:g}:{length:g}:{by}", "stuck", missing, frozen)
+        case ["drift", level, *rest] if (std := _number(level)) is not None and len(rest) < 2:
+            rate = _number(rest[0], least=-math.inf) if rest else 0.0
+            if rate is not None:
+                drifting = _with(noise, drift_std=std, drift_rate=rate)
+                return Condition(f"drift:{std:g}:{rate:g}", "drift", missing, drifting)
+        case ["delay", level, *rest] if (least := _whole(level)) is not None and len(rest) < 4:
+            most, by = _whole(rest[0]) if rest else least, rest[1] if rest[1:] else "sensor"
+            if (
+                most is not None
+                and most >= least
+                and by in GROUPINGS
+                and rest[2:] in ([], ["in_order"])
+            ):
+                random = {"max_delay": most, "group_by": by} if rest else {}
+                late = choice(
+                    "missingness", "delay", delay=least, in_order=bool(rest[2:]), **random
+                )
+                return Condition(missingness_name(late), "delay", late, noise)
+        case ["multi_rate", level, *rest] if (n := _whole(level)) and len(rest) < 3:
+            by, phase = rest[0] if rest else "sensor", _whole(rest[1]) if rest[1:] else None
+            if by in GROUPINGS and (not rest[1:] or (phase is not None and phase < n)):
+                rated = choice("missingness", "multi_rate", period=n, phase=phase, group_by=by)
+                return Condition(missingness_name(rated), "multi_rate", rated, noise)
         case ["reduction", share, by] if (r := _number(share, 1.0)) is not None:
             if by in _SELECTIONS:
                 nothing = choice("missingness", "none")
@@ -108,7 +137,10 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
     raise UserError(
         "`points` must hold trained or mechanism:eta such as mcar:0.5, with one of none, mcar, "
         "mar, nmar and eta in [0, 1], outages:eta:mean_length[:sensor, joint or kind], "
-        "reduction:ratio:model or random, noise:sigma or spikes:probability[:std]; "
+        "delay:steps[:most[:sensor, joint or kind[:in_order]]], "
+        "multi_rate:period[:sensor, joint or kind[:phase]], "
+        "reduction:ratio:model or random, noise:sigma, spikes:probability[:std], "
+        "stuck:probability[:mean_length[:sensor, joint or kind]] or drift:std[:rate]; "
         f"got {text!r}."
     )
 
@@ -158,6 +190,10 @@ def default_conditions(
         ]
         out += [f"noise:{sigma:g}" for sigma in levels["noise_sigmas"]]
         out += [f"spikes:{probability:g}" for probability in levels["spike_probabilities"]]
+        out += [f"stuck:{probability:g}" for probability in levels["stuck_probabilities"]]
+        out += [f"drift:{std:g}" for std in levels["drift_stds"]]
+        out += [f"delay:{steps}" for steps in levels["delays"]]
+        out += [f"multi_rate:{period}" for period in levels["periods"]]
     return out
 
 
@@ -221,10 +257,15 @@ def _check_outages(eta: float, mean_length: float) -> None:
         raise UserError(f"missingness=outages: {error}") from error
 
 
-def _number(text: str, most: float = math.inf) -> float | None:
-    """Read a number from 0 to ``most``; None where there is none."""
+def _whole(text: str) -> int | None:
+    """Read a whole number from 0; None where there is none."""
+    return int(text) if text.isdecimal() else None
+
+
+def _number(text: str, most: float = math.inf, *, least: float = 0.0) -> float | None:
+    """Read a number from ``least`` to ``most``; None where there is none."""
     try:
         value = float(text)
     except ValueError:
         return None
-    return value if 0 <= value <= most and value < math.inf else None
+    return value if least <= value <= most and math.isfinite(value) else None

@@ -224,8 +224,12 @@ def missingness_kind(node: Mapping[str, Any]) -> str:
         node: ``missingness`` of a run.
 
     Returns:
-        ``none``, ``mcar``, ``mar``, ``nmar``, ``outages``, or the name of somebody's own target.
+        ``none``, ``mcar``, ``mar``, ``nmar``, ``outages``, ``delay``, ``multi_rate``, or the name
+        of somebody's own target.
     """
+    for kind, key in (("delay", "delay"), ("multi_rate", "period")):
+        if key in node and "group_by" in node:
+            return kind
     if "mean_length" in node:
         return "outages"
     if node.get("eta") == 0:
@@ -245,7 +249,34 @@ def missingness_name(node: Mapping[str, Any]) -> str:
     kind = missingness_kind(node)
     if kind == "outages":
         return f"outages:{node['eta']:g}:{node['mean_length']:g}:{node['group_by']}"
+    if kind == "delay":
+        least, most = node["delay"], node["max_delay"]
+        drawn = "" if most is None else f":{most}:{node['group_by']}"
+        return f"delay:{least}{drawn}{':in_order' if drawn and node['in_order'] else ''}"
+    if kind == "multi_rate":
+        phase = "" if node["phase"] is None else f":{node['phase']}"
+        return f"multi_rate:{node['period']}:{node['group_by']}{phase}"
     return f"{kind}:{node['eta']:g}" if "eta" in node else kind
+
+
+def faults_name(node: Mapping[str, Any]) -> str:
+    """Return what is wrong with readings beside white noise, as conditions, `` spikes:0.05:5``.
+
+    Args:
+        node: ``noise`` of a run.
+
+    Returns:
+        A blank and text that recipes/evaluate.py reads back, for each; empty for none.
+    """
+    text = ""
+    if node.get("spike_probability"):
+        text += f" spikes:{node['spike_probability']:g}:{node['spike_std']:g}"
+    if node.get("stuck_probability"):
+        length = node["stuck_mean_length"]
+        text += f" stuck:{node['stuck_probability']:g}:{length:g}:{node['group_by']}"
+    if node.get("drift_std") or node.get("drift_rate"):
+        text += f" drift:{node['drift_std']:g}:{node['drift_rate']:g}"
+    return text
 
 
 # Names of folders -----------------------------------------------------------------------------

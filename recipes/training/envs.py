@@ -11,7 +11,16 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
 
-from torchrl_drbpn import ObservationNoise, ObservationSpikes, SensorOutages, seed_env
+from torchrl_drbpn import (
+    ObservationDelay,
+    ObservationMultiRate,
+    ObservationNoise,
+    ObservationSpikes,
+    SensorDrift,
+    SensorOutages,
+    StuckSensors,
+    seed_env,
+)
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 from training.config import build, one_line
 from training.errors import UserError
@@ -118,29 +127,58 @@ def env_name(config: DictConfig) -> str:
 
 
 def make_noise(
-    *, sigma: float, scale: float, spike_probability: float = 0.0, spike_std: float = 0.0
+    *,
+    sigma: float,
+    scale: float,
+    spike_probability: float = 0.0,
+    spike_std: float = 0.0,
+    stuck_probability: float = 0.0,
+    stuck_mean_length: float | None = None,
+    drift_std: float = 0.0,
+    drift_rate: float = 0.0,
+    group_by: str = "sensor",
+    id: str = "",
+    version: str | None = None,
 ) -> list[Transform]:
-    """Make what is added to the entries that arrive.
+    """Make what is wrong with the entries that arrive: drift, noise, spikes, then what is stuck.
 
     Args:
         sigma: standard deviation of white noise in units of ``scale``.
         scale: raw simulator units.
         spike_probability: of a large error, an entry and step.
         spike_std: standard deviation of that error, raw simulator units.
+        stuck_probability: that a sensor gets stuck at its last value, a step.
+        stuck_mean_length: of the time that it is stuck, steps; None: to the end of the episode.
+        drift_std: of a step of the random walk of a bias, raw simulator units.
+        drift_rate: of the bias's ramp, raw simulator units a step.
+        group_by: what gets stuck together: ``sensor``, ``joint`` or ``kind``.
+        id: task whose sensors have names to group by.
+        version: of the task.
 
     Returns:
-        The transforms, none where nothing is added.
+        The transforms, none where nothing is wrong.
     """
     made: list[Transform] = []
+    if drift_std != 0 or drift_rate != 0:
+        made.append(SensorDrift(drift_std, drift_rate))
     if sigma != 0:
         made.append(ObservationNoise(scale * sigma))
     if spike_probability != 0:
         made.append(ObservationSpikes(spike_probability, spike_std))
+    if stuck_probability != 0:
+        groups = sensor_groups(named_sensors(id, version), group_by)
+        made.append(StuckSensors(stuck_probability, stuck_mean_length, groups=groups))
     return made
 
 
 def make_outages(
-    *, eta: float, mean_length: float, group_by: str, id: str, version: str | None
+    *,
+    eta: float,
+    mean_length: float,
+    group_by: str,
+    id: str,
+    version: str | None,
+    state_key: str | None = None,
 ) -> SensorOutages:
     """Make sensors fail for a while, alone or together.
 
@@ -150,13 +188,69 @@ def make_outages(
         group_by: what fails together: ``sensor``, ``joint`` or ``kind``.
         id: task whose sensors have names to group by.
         version: of the task.
+        state_key: where which of them work is kept; two in one environment need two.
 
     Returns:
         The transform.
     """
-    return SensorOutages(
-        eta, mean_length, groups=sensor_groups(named_sensors(id, version), group_by)
-    )
+    groups = sensor_groups(named_sensors(id, version), group_by)
+    return SensorOutages(eta, mean_length, groups=groups, state_key=state_key)
+
+
+def make_delay(
+    *,
+    delay: int,
+    max_delay: int | None,
+    in_order: bool,
+    group_by: str,
+    id: str,
+    version: str | None,
+) -> ObservationDelay:
+    """Make readings arrive late.
+
+    Args:
+        delay: steps.
+        max_delay: of delays that are drawn for every reading; None: all are as late.
+        in_order: whether to drop readings that arrive after one taken later.
+        group_by: what travels in one packet: ``sensor``, ``joint`` or ``kind``.
+        id: task whose sensors have names to group by.
+        version: of the task.
+
+    Returns:
+        The transform.
+
+    Raises:
+        UserError: if the task's episodes end before anything can arrive.
+    """
+    groups = sensor_groups(named_sensors(id, version), group_by)
+    made = ObservationDelay(delay, max_delay=max_delay, in_order=in_order, groups=groups)
+    task = gymnasium.registry.get(f"{id}-{version}" if version else id)
+    steps = task and task.max_episode_steps
+    if steps and delay >= steps:
+        raise UserError(
+            f"`missingness.delay` must be shorter than the {steps} steps of an episode, got {delay}"
+            ": nothing would arrive before its end."
+        )
+    return made
+
+
+def make_multi_rate(
+    *, period: int, phase: int | None, group_by: str, id: str, version: str | None
+) -> ObservationMultiRate:
+    """Make sensors deliver now and then.
+
+    Args:
+        period: steps from one reading to the next.
+        phase: step of the first reading; None: drawn for every group and episode.
+        group_by: what delivers together: ``sensor``, ``joint`` or ``kind``.
+        id: task whose sensors have names to group by.
+        version: of the task.
+
+    Returns:
+        The transform.
+    """
+    groups = sensor_groups(named_sensors(id, version), group_by)
+    return ObservationMultiRate(period, phase="random" if phase is None else phase, groups=groups)
 
 
 def make_collector(
