@@ -130,5 +130,5 @@ def recipe(*overrides: str) -> tuple[Any, Any]:
     from ppo_drbpn import assemble
     from training.config import composed_config
 
-    config = composed_config(overrides)
+    config = composed_config([*overrides, f"threads={torch.get_num_threads()}"])
     return assemble(config), config

@@ -151,11 +151,11 @@ def main() -> None:
             show(f"a decision, {rows} robots", seconds, DEFAULTS, args)
 
 
-def train(training: Any, settings: Any) -> Callable[[], object]:
+def train(training: Any, config: Any) -> Callable[[], object]:
     """Make the call that collects one rollout and learns from it."""
     from ppo_drbpn import train_rollout
 
-    return lambda: train_rollout(training, settings)
+    return lambda: train_rollout(training, config)
 
 
 def decide(policy: Any, row: Any) -> Callable[[], object]:

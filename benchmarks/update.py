@@ -22,7 +22,6 @@ from typing import Any
 import torch
 from interleaved import measure, recipe, show, start
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
@@ -31,39 +30,34 @@ from torchrl_drbpn import PolicyStep
 POLICY, WHOLE = "TensorDict policy", "whole step"
 
 
-def update_parts(training: Any, settings: Any) -> tuple[dict[str, Callable[[], Any]], Any]:
+def update_parts(training: Any) -> tuple[dict[str, Callable[[], Any]], Any]:
     """Make the calls of one update, each with all that comes before it, and its minibatch."""
     from ppo_drbpn import collect
-    from training.ppo import add_advantages, minibatches, to_sequences
+    from training.ppo import add_advantages, minibatches
 
-    loss, belief = training.algorithm.loss, training.agent.belief
+    agent, algorithm = training.agent, training.algorithm
+    agent.norm.update(collect(training))
     data = collect(training)
-    add_advantages(data, training.agent, training.gae)
-    sequences = to_sequences(data, loss, settings.optim.sequence_length)
-    generator = torch.Generator().manual_seed(0)
-    batch = next(minibatches(sequences, settings.optim.minibatches, generator))
-    parameters = [p for p in training.agent.parameters() if p.requires_grad]
-    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
+    add_advantages(data, agent, training.gae)
+    sequences = next(algorithm.cut(data))
+    batch = next(minibatches(sequences, algorithm.steps.minibatches, algorithm.generator))
+    for group in algorithm.steps.optimizer.param_groups:
+        group["lr"] = 0.0
 
     def through_belief() -> None:
         with set_recurrent_mode(True):
-            belief(batch.copy())
+            agent.belief(batch.copy())
 
     def backward() -> None:
-        optimizer.zero_grad()
-        losses = [value for key, value in loss(batch).items() if key.startswith("loss")]
+        algorithm.steps.optimizer.zero_grad()
+        losses = [v for key, v in algorithm.loss(batch).items() if key.startswith("loss")]
         torch.autograd.backward(sum(losses))
-
-    def step() -> None:
-        backward()
-        torch.nn.utils.clip_grad_norm_(parameters, settings.optim.max_grad_norm)
-        optimizer.step()
 
     calls = {
         "belief forward": through_belief,
-        "loss forward": lambda: loss(batch),
+        "loss forward": lambda: algorithm.loss(batch),
         "loss forward and backward": backward,
-        WHOLE: step,
+        WHOLE: lambda: algorithm.step(batch),
     }
     return calls, batch
 
@@ -71,8 +65,8 @@ def update_parts(training: Any, settings: Any) -> tuple[dict[str, Callable[[], A
 def decisions(training: Any, rows: int, folder: Path | None) -> dict[str, Callable[[], Any]]:
     """Make the calls of one decision, checked against each other; AOTInductor with a folder."""
     agent = training.agent.eval()
-    step = PolicyStep(agent.belief, agent.actor.module[0].module)
-    keys = agent.belief.in_keys
+    step = PolicyStep(agent.belief, agent.actor.module[0].module, norm=agent.norm)
+    keys = ["observation", *agent.belief.in_keys[1:]]
     row = training.collector.rollout()[:1, 8:9].reshape(-1).expand(rows)
     inputs = tuple(row.get(key).clone() for key in keys)
     source = TensorDict(dict(zip(keys, inputs, strict=True)), batch_size=[rows])
@@ -83,12 +77,11 @@ def decisions(training: Any, rows: int, folder: Path | None) -> dict[str, Callab
         path = str(folder / f"policy_{rows}.pt2")
         package = torch._inductor.aoti_compile_and_package(exported, package_path=path)
         plain["AOTInductor"] = torch._inductor.aoti_load_package(package)
-    policy = TensorDictSequential(agent.belief, agent.actor)  # of normalised observations
-    expected = policy(source.copy()).get("action")
+    expected = agent.policy(source.copy()).get("action")
     for call in plain.values():
         torch.testing.assert_close(call(*inputs)[0], expected, rtol=1e-4, atol=1e-5)
     calls = {name: lambda call=call: call(*inputs) for name, call in plain.items()}
-    return {POLICY: lambda: policy(source.copy())} | calls
+    return {POLICY: lambda: agent.policy(source.copy())} | calls
 
 
 def main() -> None:
@@ -99,8 +92,8 @@ def main() -> None:
     if args.quick:
         common += ["collector.num_envs=2", "collector.steps_per_env=16", "optim.minibatches=2"]
     for name in ("defaults", "experiment=paper", "belief=none"):
-        training, settings = recipe(*([name] * (name != "defaults")), *common)
-        calls, batch = update_parts(training, settings)
+        training, _ = recipe(*([name] * (name != "defaults")), *common)
+        calls, batch = update_parts(training)
         title = f"update, {name}, minibatch of {batch.shape[0]} x {batch.shape[1]} frames"
         show(title, measure(calls, args, calls=5), WHOLE, args)
     compiler = shutil.which("g++") or shutil.which("clang++")
