@@ -79,8 +79,6 @@ class TestContractOfANetworkCovariance(TestContract):
     """Q depends on the state: the filter runs step by step."""
 
     test_it_runs_in_batched_environments = None  # once is enough
-    # over time the covariance network meets what is no number first, and that is what is refused
-    test_a_reading_that_cannot_be_counted_is_called_what_it_is = None
 
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
         belief = make_filter(obs, action, dtype, state=3, cov_network=True)

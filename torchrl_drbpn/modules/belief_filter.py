@@ -32,7 +32,7 @@ _MAX_DEFAULT_STATE = 32
 
 
 class BeliefDivergedError(ValueError):
-    """Say that the learned model left the range of its numbers; the input was sound.
+    """Report that the learned model left the range of its numbers; the input was sound.
 
     Example:
         >>> issubclass(BeliefDivergedError, ValueError)
@@ -239,17 +239,16 @@ class BeliefFilter(nn.Module):
             believed = saturate_innovation(
                 model, mean, previous_action, observation, observed, reset, gate
             )
-        out = filter_step(
-            model,
-            mean,
-            previous_action,
-            believed,
-            observed,
-            reset,
-            return_cov=return_cov,
-        )
-        # What arrived, not what a belief gone astray has made of it: the error names the cause.
-        self._check_values(out, mean, previous_action, observation, observed)
+        # The error is about the readings as they arrived, not as they were moved.
+        given = (mean, previous_action, observation, observed)
+        try:
+            out = filter_step(
+                model, mean, previous_action, believed, observed, reset, return_cov=return_cov
+            )
+        except ValueError:  # a covariance network of NaN gives no covariance
+            self._check_values(None, *given)
+            raise
+        self._check_values(out, *given)
         return out
 
     # ------------------------------------------------------------------ a sequence
@@ -295,18 +294,16 @@ class BeliefFilter(nn.Module):
                 "`mean` must be the belief before the first step, of shape (*batch, state) = "
                 f"{(*reset.shape[:-1], self.state_dim)}, got {tuple(mean.shape)}."
             )
-        out = filter_sequence(
-            self.state_space(),
-            mean,
-            previous_action,
-            observation,
-            observed,
-            reset,
-            use_stored_state=use_stored_state,
-            stored_mean=stored_mean,
-            return_cov=return_cov,
-        )
-        self._check_values(out, mean, previous_action, observation, observed)
+        given = (mean, previous_action, observation, observed)
+        try:
+            out = filter_sequence(
+                self.state_space(), mean, previous_action, observation, observed, reset,
+                use_stored_state=use_stored_state, stored_mean=stored_mean, return_cov=return_cov,
+            )  # fmt: skip
+        except ValueError:  # a covariance network of NaN gives no covariance
+            self._check_values(None, *given)
+            raise
+        self._check_values(out, *given)
         return out
 
     def predict(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
@@ -362,21 +359,22 @@ class BeliefFilter(nn.Module):
 
     def _check_values(
         self,
-        out: FilterOutput,
+        out: FilterOutput | None,
         mean: Tensor,
         previous_action: Tensor,
         observation: Tensor,
         observed: Tensor,
     ) -> None:
-        """Raise on a value that cannot be; a few sums and one number on the host tell.
+        """Raise if the output is not finite, or there is none, and name the input that caused it.
 
         The mean is looked at too: where nothing was observed the likelihood is 0 whatever it is.
         """
-        if not self.validate or torch.compiler.is_compiling() or out.mean.is_meta:
+        if not self.validate or torch.compiler.is_compiling() or observation.is_meta:
             return
-        total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
         try:
-            if bool(torch.isfinite(total)):
+            if out is not None and bool(
+                (out.log_likelihood.detach().sum() + out.mean.detach().sum()).isfinite()
+            ):
                 return
         except RuntimeError:  # under vmap no number reaches the host
             return
@@ -387,6 +385,8 @@ class BeliefFilter(nn.Module):
                     f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "
                     "by a policy or a filter that had diverged?"
                 )
+        if out is None:
+            return
         raise BeliefDivergedError(
             "the belief is no longer finite although every observed entry is: the learned model "
             "diverged. Lower the learning rate, or use residual=False where state > obs."

@@ -300,8 +300,8 @@ class ParticleFilter(nn.Module):
             return
         refuse_readings(observation, observed)
         raise BeliefDivergedError(
-            "the particles are not finite although every observed entry is: the learned model "
-            "diverged. Lower the learning rate."
+            "the particles are no longer finite although every observed entry is: the learned "
+            "model diverged. Lower the learning rate."
         )
 
 
