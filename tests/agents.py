@@ -34,6 +34,7 @@ from torchrl.objectives.value import GAE
 from torchrl_drbpn import BeliefFilter, GaussianTransition, GymnasiumBatchEnv
 
 OBS, ACTION, ENVS, TIME, LIMIT = 4, 1, 3, 24, 9
+GAMMA, LMBDA = 0.99, 0.95
 
 
 @dataclass
@@ -139,9 +140,14 @@ def collect(
     return data
 
 
+def make_gae(agent: Agent, **kwargs: Any) -> GAE:
+    """TorchRL's GAE through the belief module."""
+    keys = {"value_network": agent.value, "deactivate_vmap": True} | kwargs
+    return GAE(gamma=GAMMA, lmbda=LMBDA, **keys)
+
+
 def add_advantages(agent: Agent, data: TensorDictBase) -> TensorDictBase:
-    """TorchRL's GAE through the belief module, in place."""
-    gae = GAE(gamma=0.99, lmbda=0.95, value_network=agent.value, deactivate_vmap=True)
+    """Write advantages into a rollout."""
     with set_recurrent_mode(True), torch.no_grad():
-        gae(data)
+        make_gae(agent)(data)
     return data

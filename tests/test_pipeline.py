@@ -1,8 +1,8 @@
-"""A belief filter in a GRU's place: TorchRL's collector, GAE and ClipPPOLoss, one code for both.
+"""Belief modules in a GRU's place: TorchRL's collector, GAE and ClipPPOLoss, one code for all.
 
 Only the constructor and the keys differ. On fresh data, before any update, the importance ratio is
-1 though episodes end inside rows and rows begin in mid-episode; and GAE through the module sees the
-values of the beliefs that the collector stored.
+1 though episodes end inside rows, rows begin in mid-episode and particles are random; and GAE, in
+one pass or two, reads the values of the beliefs that the collector stored.
 """
 
 from __future__ import annotations
@@ -11,19 +11,31 @@ import functools
 
 import pytest
 import torch
-from agents import ACTION, ENVS, OBS, TIME, Agent, collect, make_agent, make_env, make_filter
+from agents import (
+    ACTION,
+    ENVS,
+    GAMMA,
+    LMBDA,
+    OBS,
+    TIME,
+    Agent,
+    collect,
+    make_agent,
+    make_env,
+    make_filter,
+    make_gae,
+)
+from particle_tools import make_filter as make_particles
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs.utils import step_mdp
 from torchrl.modules import GRUModule, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from torchrl_drbpn import BeliefFilterModule
+from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss, ParticleFilterModule
 
-GAMMA, LMBDA = 0.99, 0.95
 DTYPE = torch.float32
 
 
@@ -40,7 +52,12 @@ def belief_filter() -> BeliefFilterModule:
     return BeliefFilterModule(make_filter(OBS, ACTION, DTYPE, state=6))
 
 
+def particle_filter() -> ParticleFilterModule:
+    return ParticleFilterModule(make_particles(OBS, ACTION))
+
+
 BOTH = pytest.mark.parametrize("make_module", [gru, belief_filter])
+EVERY = pytest.mark.parametrize("make_module", [gru, belief_filter, particle_filter])
 
 
 @functools.cache
@@ -51,17 +68,7 @@ def agent_and_rollout(make_module) -> tuple[Agent, TensorDictBase]:
     return agent, collect(agent, dtype=DTYPE)
 
 
-def make_gae(agent: Agent) -> GAE:
-    return GAE(
-        gamma=GAMMA,
-        lmbda=LMBDA,
-        value_network=agent.value,
-        shifted=False,
-        deactivate_vmap=True,
-    )
-
-
-@BOTH
+@EVERY
 def test_on_fresh_data_the_ratio_and_the_effective_sample_size_are_one(make_module):
     agent, data = agent_and_rollout(make_module)
     data = data.clone()
@@ -69,19 +76,26 @@ def test_on_fresh_data_the_ratio_and_the_effective_sample_size_are_one(make_modu
     assert not data["is_init"][:, 0].all()
     with set_recurrent_mode(True), torch.no_grad():
         make_gae(agent)(data)
-    out = ClipPPOLoss(agent.policy, agent.value)(data)
-    torch.testing.assert_close(out["ESS"], torch.ones_like(out["ESS"]), rtol=1e-4, atol=0)
-    assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
-    assert out["mean_ratio"].item() == pytest.approx(1, abs=1e-4)
-    assert out["kl_approx"].item() == pytest.approx(0, abs=1e-4)
+    outputs = [ClipPPOLoss(agent.policy, agent.value)(data)]
+    if make_module is not gru:
+        ppo = ClipPPOLoss(agent.actor, agent.critic)
+        outputs.append(DRBPNLoss(agent.belief, ppo, BeliefModelLoss())(data))
+        assert outputs[1]["loss_model"].isfinite()
+    for out in outputs:
+        torch.testing.assert_close(out["ESS"], torch.ones_like(out["ESS"]), rtol=1e-4, atol=0)
+        assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
+        assert out["mean_ratio"].item() == pytest.approx(1, abs=1e-4)
+        assert out["kl_approx"].item() == pytest.approx(0, abs=1e-4)
 
 
-@BOTH
-def test_gae_sees_the_values_of_stored_and_next_beliefs(make_module):
+@pytest.mark.parametrize("shifted", [False, True])
+@EVERY
+def test_gae_reads_the_values_of_stored_and_next_beliefs(make_module, shifted):
     agent, data = agent_and_rollout(make_module)
     through = data.clone()
     with set_recurrent_mode(True), torch.no_grad():
-        make_gae(agent)(through)
+        # one pass over the sequence and, where an episode is truncated, its last observation
+        make_gae(agent, shifted=shifted, shifted_budget=TIME)(through)
 
     with torch.no_grad():
         value = agent.critic.module(data["features"])
@@ -89,19 +103,14 @@ def test_gae_sees_the_values_of_stored_and_next_beliefs(make_module):
         following = step_mdp(data, keep_other=False).select(*agent.belief.in_keys)
         with set_recurrent_mode(False):
             next_value = agent.critic.module(agent.belief(following)["features"])
-        advantage, target = generalized_advantage_estimate(
-            GAMMA,
-            LMBDA,
-            value,
-            next_value,
-            data["next", "reward"],
-            data["next", "done"],
-            data["next", "terminated"],
-        )
+        ends = (data["next", key] for key in ("reward", "done", "terminated"))
+        advantage, target = generalized_advantage_estimate(GAMMA, LMBDA, value, next_value, *ends)
     assert data["next", "truncated"][:, :-1].any()
+    assert through.get("shifted_valid", torch.ones(())).all()
+    limit = 1e-4 if make_module is particle_filter else 1e-5
     scale = advantage.abs().max().item()
-    torch.testing.assert_close(through["advantage"], advantage, rtol=1e-5, atol=1e-5 * scale)
-    torch.testing.assert_close(through["value_target"], target, rtol=1e-5, atol=1e-5 * scale)
+    torch.testing.assert_close(through["advantage"], advantage, rtol=limit, atol=limit * scale)
+    torch.testing.assert_close(through["value_target"], target, rtol=limit, atol=limit * scale)
 
 
 @BOTH

@@ -1,8 +1,7 @@
 r"""Choose sensors: the components whose readings leave the belief least uncertain.
 
 With x = H s + eps, s ~ N(m, P) and eps ~ N(0, R), reading the rows S leaves the covariance
-:math:`P^+_S`, whatever the readings are (eq. 10 [DRBPN]). So which sensors are worth having is
-known from H, P and R alone.
+:math:`P^+_S`, whatever the readings are (eq. 10 [DRBPN]), so that H, P and R alone rank sensors.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class SensorSelection(NamedTuple):
         objective: of :math:`P^+` after ``always`` and the sensors up to this one: its
             log-determinant for "D" (nats), the trace of :math:`C P^+ C'` for "A" (squared units
             of the target); float64, shape ``(*batch, count)``.
-        information: what these readings say about the state beyond ``always``,
+        information: mutual information of the state and these readings given ``always``,
             :math:`\tfrac12 (\log|P^+_{always}| - \log|P^+|)`, nats; float64, the same shape.
 
     Example:
@@ -70,7 +69,7 @@ def select_sensors(
     - D, diagonal R: :math:`I(s; x_S)` is monotone and submodular, hence at least
       :math:`1 - 1/e` of the best set of that size [Nemhauser, Wolsey, Fisher 1978; Krause,
       Guestrin 2005; Shamaiah, Banerjee, Vikalo 2010].
-    - D with a full R (a sensor may read nothing but another one's noise) and A are monotone, not
+    - D with a full R (a sensor may read another one's noise alone) and A are monotone, not
       submodular: no such bound [Bian, Buhmann, Krause, Tschiatschek 2017; Chamon, Pappas,
       Ribeiro 2021].
 
@@ -86,17 +85,16 @@ def select_sensors(
 
     Keyword Args:
         criterion: "D", the log-determinant, or "A", the trace.
-        always: sensors that are there anyway: indices, or bool of shape ``(obs,)``; they are read
-            first and not chosen.
-        target: C, what of the state is to be known, shape ``(*batch, target, state)``; "A" only.
-            None: the whole state, C = I.
+        always: sensors that are read in any case and not chosen: indices, or bool ``(obs,)``.
+        target: C, the combinations of the state whose variances count for "A", shape
+            ``(*batch, target, state)``; None: the whole state, C = I.
 
     Returns:
         The :class:`SensorSelection`; computed in float64, no gradient.
 
     Raises:
-        ValueError: for shapes that do not fit, covariances that are none, values that are not
-            finite, an unknown criterion, sensors that do not exist, or more than there are.
+        ValueError: for shapes that do not fit, matrices that are no covariances, values that are
+            not finite, an unknown criterion, or sensors that do not exist.
 
     Example:
         >>> import torch
@@ -115,14 +113,11 @@ def select_sensors(
     H, P, R = _as_matrices(emission_matrix, predicted_cov, emission_cov)
     obs, batch = H.shape[-2], H.shape[:-2]
     C, there = _as_target(target, H), _as_indices(always, obs)
-    if (
-        isinstance(count, bool)
-        or not isinstance(count, Integral)
-        or not 0 <= count <= obs - len(there)
-    ):
+    free, whole = obs - len(there), isinstance(count, Integral) and not isinstance(count, bool)
+    if not whole or not 0 <= count <= free:
         raise ValueError(
-            f"`count` must be an int from 0 to {obs - len(there)}, the sensors that are not in "
-            f"`always`, got {count!r}."
+            f"`count` must be an int from 0 to {free}, the sensors that are not in `always`, got "
+            f"{count!r}."
         )
     # Given the readings so far: covariances of (x, C s) with x, and of the noise. Both matrices
     # lose a multiple of the same row with every reading, so the first two are one.
@@ -137,30 +132,30 @@ def select_sensors(
         own = noise.diagonal(dim1=-2, dim2=-1).masked_fill(seen, 1.0)
         variance = joint[..., :obs, :].diagonal(dim1=-2, dim2=-1).masked_fill(seen, 1.0)
         variance = torch.maximum(variance, own)
-        told = 0.5 * (variance / own).log()  # I(s; x_i | readings)
+        gained = 0.5 * (variance / own).log()  # I(s; x_i | readings)
         lowered = joint[..., obs:, :].square().sum(-2) / variance  # by how much tr C P+ C' falls
         if place < len(there):
             index = torch.full((*batch, 1), there[place], device=H.device)
         else:
-            gain = (told if criterion == "D" else lowered).masked_fill(seen, -torch.inf)
+            gain = (gained if criterion == "D" else lowered).masked_fill(seen, -torch.inf)
             tie = _TIE if criterion == "D" else _TIE * initial_trace.unsqueeze(-1)
             # The first True: mathematically equal gains differ by rounding.
             best = gain >= gain.amax(-1, keepdim=True) - tie
             index = best.to(torch.uint8).argmax(-1, keepdim=True)
-        information = information + told.gather(-1, index).squeeze(-1)
+        information = information + gained.gather(-1, index).squeeze(-1)
         trace = trace - lowered.gather(-1, index).squeeze(-1)
         seen = seen.scatter(-1, index, True)
         joint, noise = _without(joint, index), _without(noise, index)
         steps.append((index.squeeze(-1), trace, information))
-    before = steps[len(there) - 1][2] if there else torch.zeros_like(trace)
-    chosen = steps[len(there) :]
-    if not chosen:
+    if not steps:
         nothing = H.new_zeros(*batch, 0)
         return SensorSelection(nothing.long(), nothing, nothing)
-    indices, traces, told_so_far = (torch.stack(part, -1) for part in zip(*chosen, strict=True))
+    indices, traces, informations = (torch.stack(part, -1) for part in zip(*steps, strict=True))
     log_det = torch.linalg.slogdet(P).logabsdet.unsqueeze(-1)
-    objective = log_det - 2.0 * told_so_far if criterion == "D" else traces
-    return SensorSelection(indices, objective, told_so_far - before.unsqueeze(-1))
+    objective = log_det - 2.0 * informations if criterion == "D" else traces
+    if there:
+        informations = informations - informations[..., len(there) - 1 : len(there)]
+    return SensorSelection(*(x[..., len(there) :] for x in (indices, objective, informations)))
 
 
 def _without(cov: Tensor, index: Tensor) -> Tensor:
@@ -173,15 +168,14 @@ def _without(cov: Tensor, index: Tensor) -> Tensor:
 
 
 def _as_matrices(H: Tensor, P: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return H, P and R as matrices in float64 with one batch shape, or say what is wrong."""
+    """Return H, P and R as matrices in float64 with one batch shape; refuse what is none."""
     if H.ndim < 2 or 0 in H.shape[-2:] or not bool(H.isfinite().all()):
         raise ValueError(
             f"`emission_matrix` must be H, finite, of shape (*batch, obs, state), got "
             f"{tuple(H.shape)}. Was it learned, and did it diverge?"
         )
-    obs, state = H.shape[-2:]
     R = R.diag() if R.ndim == 1 else R
-    for name, cov, size in (("predicted_cov", P, state), ("emission_cov", R, obs)):
+    for name, cov, size in (("predicted_cov", P, H.shape[-1]), ("emission_cov", R, H.shape[-2])):
         if cov.shape[-2:] != (size, size):
             raise ValueError(
                 f"`{name}` must be of shape (*batch, {size}, {size}) as `emission_matrix` "
@@ -195,51 +189,43 @@ def _as_matrices(H: Tensor, P: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tenso
                 f"`{name}` must be finite, symmetric and positive definite: a direction without "
                 "any variance has no log-determinant. Add a small variance to its diagonal."
             )
+    shapes = [x.shape[:-2] for x in (H, P, R)]
     try:
-        batch = (H[..., 0, 0] + P[..., 0, 0] + R[..., 0, 0]).shape
+        batch = torch.broadcast_shapes(*shapes)
     except RuntimeError as error:
         raise ValueError(
             "`emission_matrix`, `predicted_cov` and `emission_cov` must have batch shapes that "
-            f"broadcast, got {tuple(H.shape[:-2])}, {tuple(P.shape[:-2])}, {tuple(R.shape[:-2])}."
+            f"broadcast, got {', '.join(str(tuple(shape)) for shape in shapes)}."
         ) from error
-    P, R = (0.5 * (cov + cov.mT) for cov in (P.double(), R.double()))
-    return (
-        H.double().expand(*batch, obs, state),
-        P.expand(*batch, state, state),
-        R.expand(*batch, obs, obs),
-    )
+    H, P, R = (x.double().expand(*batch, *x.shape[-2:]) for x in (H, P, R))
+    return H, 0.5 * (P + P.mT), 0.5 * (R + R.mT)
 
 
 def _as_target(C: Tensor | None, H: Tensor) -> Tensor:
     """Return C in float64 and in H's batch shape; the identity where there is none."""
     state, batch = H.shape[-1], H.shape[:-2]
     C = torch.eye(state, dtype=H.dtype, device=H.device) if C is None else C.double()
-    given = (1,) * (len(batch) + 2 - C.ndim) + C.shape
-    fits = all(mine in (1, wanted) for mine, wanted in zip(given, batch, strict=False))
-    if (
-        C.ndim < 2
-        or len(given) > len(batch) + 2
-        or C.shape[-1] != state
-        or not fits
-        or not bool(C.isfinite().all())
-    ):
-        raise ValueError(
-            f"`target` must be finite and of shape (*batch, target, state) with state={state} and "
-            f"the batch shape {tuple(batch)} of the model or none, got {tuple(C.shape)}."
-        )
-    return C.expand(*batch, *C.shape[-2:])
+    try:
+        if C.ndim >= 2 and C.shape[-1] == state and bool(C.isfinite().all()):
+            return C.expand(*batch, *C.shape[-2:])
+    except RuntimeError:  # a batch shape of its own: refused below
+        pass
+    raise ValueError(
+        f"`target` must be finite and of shape (*batch, target, state) with state={state} and "
+        f"the batch shape {tuple(batch)} of the model or none, got {tuple(C.shape)}."
+    )
 
 
 def _as_indices(always: Sequence[int] | Sequence[bool] | Tensor, obs: int) -> list[int]:
-    """Return the indices of the sensors that are there anyway, each once, in order."""
+    """Return the indices of the sensors that are always read, each once, in order."""
     tensor = torch.as_tensor(always)
     if tensor.numel() == 0 and tensor.dtype != torch.bool:
         return []
     flags = tensor.dtype == torch.bool
     if tensor.ndim != 1 or tensor.is_floating_point() or (flags and len(tensor) != obs):
         raise ValueError(
-            f"`always` must be a list of indices, or {obs} bools, True where a sensor is there "
-            f"anyway, got {always!r}."
+            f"`always` must be a list of indices, or {obs} bools, True for a sensor that is always "
+            f"read, got {always!r}."
         )
     indices = tensor.nonzero().flatten() if flags else tensor
     if bool(((indices < -obs) | (indices >= obs)).any()):
