@@ -1,4 +1,4 @@
-"""Duties of every belief module; see contracts.py."""
+"""Requirements of every belief module; see contracts.py."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import (
     Compose,
     DoubleToFloat,
@@ -65,11 +64,11 @@ def with_belief_entries(
 
 
 class BeliefModuleContract(BeliefFrames):
-    """Duties of a belief module: what `GRUModule` does in a TorchRL pipeline, and the age rule.
+    """What `GRUModule` does in a TorchRL pipeline, and the age rule.
 
-    One step at a time `is_init` starts from the module's own beginning. Over time `is_init & (age
+    One step at a time `is_init` starts from the module's initial state. Over time `is_init & (age
     == 0)` does, and `is_init` with an older age takes the stored state; without `is_init` the state
-    is carried on.
+    of the step before is taken.
 
     Attributes:
         age_key: the root entry that counts updates since the reset.
@@ -107,13 +106,12 @@ class BeliefModuleContract(BeliefFrames):
         short = self.make_module(in_key=("agent", "observation"), out_key=("agent", "embed"))
         frames = self.one_by_one(plain, self.make_frames((3, 4)), self.some_state(plain, (3,)))
         expected = self.as_sequence(plain, frames)["features"]
-        frames.rename_key_("observation", ("agent", "observation"))
+        frames = frames.exclude("features").rename_key_("observation", ("agent", "observation"))
         with set_recurrent_mode(True):
-            shortened = short(frames.clone())
-            renamed = named(frames.exclude("features").rename_key_("is_init", "i"))
-        assert torch.equal(renamed["agent", "embed"], expected)
-        assert torch.equal(shortened["agent", "embed"], expected)
-        assert "features" not in renamed
+            outputs = short(frames.clone()), named(frames.rename_key_("is_init", "i"))
+        for out in outputs:
+            assert torch.equal(out["agent", "embed"], expected)
+            assert "features" not in out
 
     @pytest.mark.parametrize("over_time", [False, True])
     def test_a_mask_declared_absent_is_all_true_and_an_action_zero(self, over_time):
@@ -170,17 +168,6 @@ class BeliefModuleContract(BeliefFrames):
         assert out.batch_size == (*shape, 12)
         self.assert_same(module, out.reshape(count, 12), rollout)
 
-    def test_a_reset_inside_a_row_equals_two_sequences(self):
-        module = self.make_module(dtype=torch.float64)
-        frames = self.make_frames((2, 9), torch.float64)
-        frames["is_init"][:, [0, 4]] = True
-        whole = self.as_sequence(module, self.one_by_one(module, frames, None))
-        parts = [
-            self.as_sequence(module, self.one_by_one(module, part, None))
-            for part in (frames[:, :4], frames[:, 4:])
-        ]
-        self.assert_same(module, whole, torch.cat(parts, 1))
-
     def test_a_row_goes_on_from_the_state_stored_at_its_first_step(self):
         module = self.make_module(dtype=torch.float64)
         frames = self.make_frames((2, 9), torch.float64)
@@ -197,7 +184,7 @@ class BeliefModuleContract(BeliefFrames):
             self.as_sequence(module, other)["features"][:, 0], rollout["features"][:, 5]
         )
 
-    def test_is_init_with_an_older_age_is_a_seam_over_time_and_a_reset_one_step_at_a_time(self):
+    def test_is_init_with_an_older_age_joins_slices_over_time_and_resets_one_step_at_a_time(self):
         # two slices of one episode in one row, as TorchRL's SliceSampler lays them out
         module = self.make_module(dtype=torch.float64)
         frames = self.make_frames((2, 12), torch.float64)
@@ -206,16 +193,16 @@ class BeliefModuleContract(BeliefFrames):
         slices = [rollout[:, 2:5].clone(), rollout[:, 8:12].clone()]
         for piece in slices:
             piece["is_init"][:, 0] = True
-        stitched = torch.cat(slices, 1)
+        joined = torch.cat(slices, 1)
         expected = torch.cat([rollout[:, 2:5], rollout[:, 8:12]], 1)
-        assert (stitched[self.age_key][:, [0, 3]] > 0).all()
-        self.assert_same(module, self.as_sequence(module, stitched), expected)
-        seam = stitched[:, 3].select(*module.in_keys)
-        alone = module(seam.clone())
+        assert (joined[self.age_key][:, [0, 3]] > 0).all()
+        self.assert_same(module, self.as_sequence(module, joined), expected)
+        joint = joined[:, 3].select(*module.in_keys)
+        alone = module(joint.clone())
         assert alone["next"][self.age_key].eq(1).all()
         for key in self.state_keys(module):
-            seam[key].zero_()
-        self.assert_same(module, alone, module(seam))
+            joint[key].zero_()
+        self.assert_same(module, alone, module(joint))
 
     def test_an_episode_start_ignores_whatever_state_is_stored(self):
         module = self.make_module()
@@ -239,7 +226,7 @@ class BeliefModuleContract(BeliefFrames):
         assert following.tolist() == [1, 2, 3, 4, 1, 2]
 
     @pytest.mark.parametrize("over_time", [False, True])
-    def test_without_recurrent_entries_rows_begin_at_the_beginning_and_one_warning_says_so(
+    def test_without_recurrent_entries_rows_start_from_the_initial_state_with_one_warning(
         self, over_time
     ):
         module = self.make_module()
@@ -267,7 +254,7 @@ class BeliefModuleContract(BeliefFrames):
         ):
             module(data)
 
-    def test_what_was_read_is_left_as_it_was(self):
+    def test_its_inputs_are_not_changed(self):
         module = self.make_module()
         frames = self.make_frames((3, 6))
         rollout = self.one_by_one(module, frames, self.some_state(module, (3,)))
@@ -339,29 +326,7 @@ class BeliefModuleContract(BeliefFrames):
         for batch in batches:
             self.check_collected(module, batch)
 
-    def test_slices_of_a_replay_buffer_replay_the_beliefs_that_were_collected(self):
-        module = self.make_module(dtype=torch.float64)
-        frames = self.make_frames((4, 9), torch.float64)
-        frames["is_init"][:, [0, 6]] = True
-        rollout = self.one_by_one(module, frames, None)
-        ends = torch.zeros(4, 9, 1, dtype=torch.bool)
-        ends[:, [5, 8]] = True
-        rollout["next", "done"] = ends
-        sampler = SliceSampler(slice_len=3, end_key=("next", "done"), strict_length=True)
-        buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(36), sampler=sampler, batch_size=36
-        )
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            buffer.extend(rollout.reshape(-1))
-            sample = buffer.sample()
-        sample["is_init"][::3] = True  # as TorchRL marks slices for recurrent modules
-        assert (sample[self.age_key][::3] > 0).any()
-        self.assert_same(
-            module, self.as_sequence(module, sample.reshape(3, 12)).reshape(-1), sample
-        )
-
-    def test_its_entries_are_made_contiguous_beside_a_gru_s_and_no_other(self):
+    def test_only_its_own_entries_are_made_contiguous(self):
         module = self.make_module()
         gru = GRUModule(input_size=OBS, hidden_size=3, in_key="observation", out_key="gru")
         data = self.make_frames((2, 5)).set("other", torch.zeros(5, 2).mT)
@@ -453,7 +418,7 @@ class BeliefModuleContract(BeliefFrames):
             self.make_module(**kwargs)
 
     @pytest.mark.parametrize("name", ["in_keys", "out_keys"])
-    def test_one_string_is_no_list_of_keys_and_a_list_is_a_nested_key(self, name):
+    def test_a_string_is_refused_as_a_list_of_keys_and_a_list_is_a_nested_key(self, name):
         with pytest.raises(
             TypeError, match=f"`{name}` must be a list of keys or a dict, got 'feat"
         ):
@@ -490,7 +455,7 @@ class BeliefModuleContract(BeliefFrames):
             ),
         ],
     )
-    def test_a_reading_that_cannot_be_counted_is_called_what_it_is(self, over_time, wrong, message):
+    def test_a_reading_that_is_not_usable_is_named(self, over_time, wrong, message):
         module = self.make_module()
         data = self.one_by_one(module, self.make_frames((3, 4)), self.some_state(module, (3,)))
         data["observed"][1, 2, 3], data["observation"][1, 2, 3] = True, wrong
@@ -501,7 +466,7 @@ class BeliefModuleContract(BeliefFrames):
             module(data.select(*module.in_keys))
 
     @pytest.mark.parametrize("over_time", [False, True])
-    def test_no_tensor_is_made_on_another_device(self, over_time):
+    def test_every_tensor_is_made_on_the_device_of_the_input(self, over_time):
         # the device "meta" refuses to be mixed with "cpu", as a GPU does
         module = self.make_module(out_keys=self.all_outputs)
         data = self.one_by_one(module, self.make_frames((3, 4)), self.some_state(module, (3,)))
@@ -548,13 +513,13 @@ class BeliefModuleContract(BeliefFrames):
             assert parameter.grad.isfinite().all(), name
             assert parameter.grad.any(), name
 
-    def test_the_primer_of_a_policy_elsewhere_resets_where_the_environment_is(self):
+    def test_the_primer_does_not_take_the_device_of_the_policy(self):
         """An environment without a device resets on the CPU, whatever the policy runs on."""
         primer = self.make_module().to("meta").make_tensordict_primer()
         for spec in primer.primers.values(True, True):
             assert spec.device is None or spec.device.type == "cpu"
 
-    def test_what_a_missing_entry_holds_changes_neither_values_nor_gradient(self):
+    def test_the_content_of_a_missing_entry_changes_neither_values_nor_gradient(self):
         outputs, grads = [], []
         for junk in (0.0, 7.0, float("nan"), float("inf")):
             module = self.make_module(dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Duties that every loss and belief module of the package must meet.
+"""Requirements that every loss and belief module of the package must meet.
 
 Those of transforms are in `test_transforms_requirements.py`.
 
@@ -10,7 +10,7 @@ copies, dtypes and devices.
 
 `BeliefModuleContract` is what `GRUModule` does in a TorchRL pipeline (one step or whole sequences,
 primer, collector, batched environments, compile, export), and this package's rule for what a
-recurrent module starts from: the beginning where `is_init & (age == 0)`, else the stored state.
+recurrent module starts from: the initial state where `is_init & (age == 0)`, else the stored one.
 
 `RecipeBeliefContract` is what the recipe needs of any belief module, with or without memory, with
 or without a model.

@@ -1,9 +1,9 @@
 """PolicyStep: one decision on plain tensors.
 
-Specified here: over whole episodes, resets and missing entries included, its action and its state
-are those of the TensorDict policy acting with its mean, in every form of the filter, normalised or
-not; what is no number is missing and counted; the action fed back is the one that was chosen; it is
-a frozen copy; torch.export takes it, with a batch of any size, and gives the same numbers.
+Specified here: over whole episodes its action and its state are those of the TensorDict policy
+acting with its mean, in every form of the filter, normalised or not; what is no finite number is
+missing and counted; the action fed back is the one that was chosen; it is a frozen copy;
+torch.export takes it, with a batch of any size, and gives the same numbers.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ ACTION, BATCH, TIME = 2, 3, 12
 
 def perturbed(module: nn.Module) -> nn.Module:
     """Move every parameter away from where it starts."""
-    generator = torch.Generator().manual_seed(1)
+    g = torch.Generator().manual_seed(1)
     with torch.no_grad():
-        for parameter in module.parameters():
-            noise = torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
-            parameter += 0.1 * noise
+        for p in module.parameters():
+            p += 0.1 * torch.randn(p.shape, generator=g, dtype=p.dtype)
     return module
 
 
@@ -50,12 +49,16 @@ def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float
         policy_input=policy_input,
         **keys,
     )
-    head = nn.Sequential(
-        nn.Linear(belief.feature_dim, 8, dtype=dtype),
-        nn.Tanh(),
-        nn.Linear(8, ACTION, dtype=dtype),
-    )
-    return perturbed(belief), perturbed(head)
+    layers = nn.Linear(belief.feature_dim, 8, dtype=dtype), nn.Linear(8, ACTION, dtype=dtype)
+    return perturbed(belief), perturbed(nn.Sequential(layers[0], nn.Tanh(), layers[1]))
+
+
+def first_step(belief: BeliefFilterModule):
+    """The arguments of a PolicyStep at the first step of an episode."""
+    observation, observed, is_init = (x[0] for x in inputs(belief.filter.obs_dim))
+    action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
+    mean = torch.zeros(BATCH, belief.filter.state_dim, dtype=torch.float64)
+    return [observation, observed, action, is_init, mean, torch.zeros(BATCH, 1).long()]
 
 
 def inputs(obs: int, dtype: torch.dtype = torch.float64, seed: int = 0):
@@ -162,23 +165,17 @@ def test_a_float32_step_has_the_digits_of_the_float32_module(obs, state, cov):
 def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
     belief, head = make(kind)
     step = PolicyStep(belief, head)
-    g = torch.Generator().manual_seed(3)
-    obs, state = belief.filter.obs_dim, belief.filter.state_dim
-    reading = torch.randn(*batch, obs, generator=g).double()
-    seen = torch.rand(*batch, obs, generator=g) < 0.7
-    action, mean = (
-        torch.zeros(*batch, ACTION).double(),
-        torch.randn(*batch, state, generator=g).double(),
-    )
-    first, age = torch.zeros(*batch, 1, dtype=torch.bool), torch.ones(*batch, 1).long()
-    chosen, filtered = step(reading, seen, action, first, mean, age)[:2]
-    assert chosen.shape == (*batch, ACTION)
-    flat = [x.reshape(-1, x.shape[-1]) for x in (reading, seen, action, first, mean, age)]
-    torch.testing.assert_close(filtered.reshape(-1, state), step(*flat)[1])
+    rows = [x.expand(2, *x.shape).flatten(0, 1) for x in first_step(belief)]  # six
+    rows[3], rows[4] = torch.zeros_like(rows[3]), torch.randn_like(rows[4])
+    rows = [x[: torch.Size(batch).numel()] for x in rows]
+    action, mean = step(*(x.reshape(*batch, x.shape[-1]) for x in rows))[:2]
+    expected = step(*rows)
+    torch.testing.assert_close(action.reshape(-1, ACTION), expected[0])
+    torch.testing.assert_close(mean.reshape(expected[1].shape), expected[1])
     step.float()
     assert step.initial_state(2)[0].dtype == torch.float32
-    cast = step(reading.float(), seen, action.float(), first, mean.float(), age)[1]
-    torch.testing.assert_close(cast.double(), filtered, rtol=1e-4, atol=1e-4)
+    narrow = [x.float() if x.is_floating_point() else x for x in rows]
+    torch.testing.assert_close(step(*narrow)[1].double(), expected[1], rtol=1e-4, atol=1e-4)
 
 
 def test_a_normalised_policy_is_one_step_with_its_statistics():
@@ -199,12 +196,11 @@ def test_a_normalised_policy_is_one_step_with_its_statistics():
 @pytest.mark.parametrize("normed", [False, True])
 @pytest.mark.parametrize("junk", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("kind", ["innovation", "information", "network"])
-def test_what_is_no_number_is_missing_and_counted_where_it_was_called_observed(kind, junk, normed):
+def test_a_reading_that_is_not_finite_counts_as_missing_and_is_counted(kind, junk, normed):
     belief, head = make(kind)
-    obs = belief.filter.obs_dim
-    step = PolicyStep(belief, head, norm=MaskedObservationNorm(obs) if normed else None)
-    observation, observed, is_init = (x[0] for x in inputs(obs))
-    rest = (torch.zeros(BATCH, ACTION, dtype=torch.float64), is_init, *step.initial_state(BATCH))
+    norm = MaskedObservationNorm(belief.filter.obs_dim) if normed else None
+    step = PolicyStep(belief, head, norm=norm)
+    observation, observed, *rest = first_step(belief)
     *clean, none = step(observation, observed, *rest)
     assert not none.any()
     spoilt = step(torch.where(observed, observation, junk), torch.ones_like(observed), *rest)
@@ -224,7 +220,7 @@ def test_later_training_does_not_reach_the_copy():
     assert not any(p.requires_grad for p in step.parameters())
 
 
-def test_limits_clip_the_action_and_leave_what_is_fed_back():
+def test_limits_clip_the_action_and_not_what_is_fed_back():
     belief, head = make("innovation")
 
     class LocScale(nn.Module):
@@ -236,12 +232,9 @@ def test_limits_clip_the_action_and_leave_what_is_fed_back():
             return self.location(features), torch.ones(2)
 
     high = torch.full((ACTION,), 0.05, dtype=torch.float64)
-    plain = PolicyStep(belief, head)
     limited = PolicyStep(belief, LocScale(), action_low=-high, action_high=high)
-    observation, observed, is_init = (x[0] for x in inputs(4))
-    rest = (torch.zeros(BATCH, ACTION, dtype=torch.float64), is_init, *plain.initial_state(BATCH))
-    action = plain(observation, observed, *rest)[0]
-    clipped, _, _, chosen, _ = limited(observation, observed, *rest)
+    action = PolicyStep(belief, head)(*first_step(belief))[0]
+    clipped, _, _, chosen, _ = limited(*first_step(belief))
     assert action.abs().max() > 0.05
     assert torch.equal(clipped, action.clamp(-0.05, 0.05))
     assert torch.equal(chosen, action)
@@ -250,18 +243,14 @@ def test_limits_clip_the_action_and_leave_what_is_fed_back():
 
 
 @pytest.mark.parametrize(("place", "width"), [(0, 1), (1, 1), (2, 1), (3, ACTION), (4, 1), (5, 2)])
-def test_a_tensor_of_another_width_is_refused_and_not_broadcast(place, width):
+def test_a_tensor_of_another_width_or_batch_is_refused_and_not_broadcast(place, width):
     belief, head = make("innovation")
-    step = PolicyStep(belief, head)
-    observation, observed, is_init = (x[0] for x in inputs(4))
-    action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
-    args = [observation, observed, action, is_init, *step.initial_state(BATCH)]
-    args[place] = args[place][:, :1].expand(BATCH, width)
-    with pytest.raises(ValueError, match=r"must be .* of shape \(\*batch, \d\)"):
-        step(*args)
-    args[place] = args[place][:1]
-    with pytest.raises(ValueError, match=r"must be .* of shape \(\*batch, \d\)"):
-        step(*args)
+    step, args = PolicyStep(belief, head), first_step(belief)
+    wide = args[place][:, :1].expand(BATCH, width)
+    for wrong in (wide, wide[:1]):
+        args[place] = wrong
+        with pytest.raises(ValueError, match=r"must be .* of shape \(\*batch, \d\)"):
+            step(*args)
 
 
 @pytest.mark.parametrize("kind", ["innovation", "information", "network"])
@@ -270,10 +259,8 @@ def test_export_takes_it_with_any_batch(kind):
     limit = torch.full((ACTION,), 0.05, dtype=torch.float64)
     norm = MaskedObservationNorm(belief.filter.obs_dim)
     step = PolicyStep(belief, head, norm=norm, action_low=-limit, action_high=limit)
-    observation, observed, is_init = (x[0] for x in inputs(belief.filter.obs_dim))
-    observation[0, 0] = torch.nan
-    action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
-    args = (observation, observed, action, is_init, *step.initial_state(BATCH))
+    args = tuple(first_step(belief))
+    args[0][0, 0] = torch.nan
     batch = torch.export.Dim("batch", min=1, max=1024)
     exported = torch.export.export(step, args, dynamic_shapes=tuple({0: batch} for _ in args))
     for size in (BATCH, 7):
@@ -290,12 +277,9 @@ def test_it_is_saved_and_loaded_as_a_state_dict():
     assert torch.equal(run_step(other, 4)[0], run_step(step, 4)[0])
 
 
-def test_a_belief_of_another_kind_is_refused():
-    with pytest.raises(TypeError, match="`belief` must be a BeliefFilterModule"):
-        PolicyStep(nn.Linear(2, 2), nn.Linear(2, 2))
-
-
-def test_one_limit_alone_is_refused():
+def test_another_belief_module_and_one_limit_alone_are_refused():
     belief, head = make("innovation")
+    with pytest.raises(TypeError, match="`belief` must be a BeliefFilterModule"):
+        PolicyStep(head, head)
     with pytest.raises(ValueError, match="given together"):
         PolicyStep(belief, head, action_low=torch.zeros(2))

@@ -191,7 +191,7 @@ def _as_matrices(H: Tensor, P: Tensor, R: Tensor) -> tuple[Tensor, Tensor, Tenso
             )
     shapes = [x.shape[:-2] for x in (H, P, R)]
     try:
-        batch = torch.broadcast_shapes(*shapes)
+        batch = (H[..., 0, 0] + P[..., 0, 0] + R[..., 0, 0]).shape
     except RuntimeError as error:
         raise ValueError(
             "`emission_matrix`, `predicted_cov` and `emission_cov` must have batch shapes that "
