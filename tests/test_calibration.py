@@ -2,7 +2,7 @@
 
 Held to a truth that does not use them: the exact Kalman filter on a known linear system (NIS and
 NEES have the mean that theory says, whatever is missing), quantiles with closed forms, deleted
-entries. A filter with a wrong covariance is told from a right one.
+entries. The test separates a filter with a wrong covariance from a right one.
 """
 
 from __future__ import annotations
@@ -58,13 +58,8 @@ class Filtered:
         for t in range(TIME):
             if t:
                 state = system.transition(state, action) + normal(system.transition_cov)
-                belief = predict(
-                    belief,
-                    system.transition,
-                    system.transition_cov,
-                    action,
-                    jacobian=system.dynamics,
-                )
+                step = (system.transition, system.transition_cov, action)
+                belief = predict(belief, *step, jacobian=system.dynamics)
             # Shares of what arrives from a fifth to all, and steps with nothing.
             share = 0.2 + 0.8 * (t % 5) / 4
             seen = torch.rand(BATCH, OBS, generator=g) < share
@@ -114,12 +109,12 @@ def test_the_consistency_test_passes_the_exact_filter_and_fails_wrong_covariance
 ) -> None:
     ratio, lower, upper = consistency(exact.nis, exact.dof, probability=0.999)
     assert lower < ratio < upper
-    too_sure, too_modest = Filtered(claimed=0.8), Filtered(claimed=1.25)
-    assert consistency(too_sure.nis, too_sure.dof, 0.999).ratio > upper
-    assert consistency(too_modest.nis, too_modest.dof, 0.999).ratio < lower
+    too_small, too_large = Filtered(claimed=0.8), Filtered(claimed=1.25)
+    assert consistency(too_small.nis, too_small.dof, 0.999).ratio > upper
+    assert consistency(too_large.nis, too_large.dof, 0.999).ratio < lower
 
 
-def test_a_constant_covariance_is_too_sure_in_outages_which_its_average_nis_does_not_tell() -> None:
+def test_a_constant_covariance_is_too_small_in_outages_though_its_average_nis_is_right() -> None:
     """The figures of docs/calibration.md, on fewer and shorter sequences."""
     model = constant_covariance.system()
     case = (0.5, 20.0, False)
@@ -231,7 +226,7 @@ def test_a_float32_belief_at_the_noise_floor_has_the_nis_of_float64(
 # Bad input ---------------------------------------------------------------------------------------
 
 
-def test_bad_input_is_answered_with_its_name() -> None:
+def test_bad_input_is_refused_by_name() -> None:
     numbers = torch.ones(2, 3)
     with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
         nis(numbers, torch.eye(3), numbers)
