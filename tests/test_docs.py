@@ -29,6 +29,8 @@ PACKAGE = ROOT / "torchrl_drbpn"
 PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 SCRIPT = DOCS / "guide" / "library_example.py"
 GUIDE = DOCS / "guide" / "belief_in_your_ppo.md"
+FAULTS = DOCS / "faults.md"
+SIMULATOR = DOCS / "faults" / "faulty_simulator.py"
 EXTENDING = DOCS / "extending.md"
 EXAMPLE = DOCS / "extending"
 EQUATIONS = {2, 3, 8, 10, 11, 12, 13}
@@ -236,10 +238,11 @@ def blocks_of(page: Path, language: str = "python") -> list[str]:
     ("blocks", "script"),
     [
         (blocks_of(GUIDE), SCRIPT),
+        (blocks_of(FAULTS), SIMULATOR),
         (blocks_of(EXTENDING)[:1], EXAMPLE / "drift.py"),
         (blocks_of(EXTENDING)[1:], EXAMPLE / "cautious.py"),
     ],
-    ids=["guide", "transform", "loss"],
+    ids=["guide", "faults", "transform", "loss"],
 )
 def test_the_blocks_of_a_page_are_the_script_and_all_of_it(blocks, script):
     rest = script.read_text(encoding="utf-8")
@@ -273,6 +276,19 @@ def test_the_script_of_the_guide_imports_core_dependencies_alone():
         )
     }
     assert modules <= {"torch", "tensordict", "torchrl", "torchrl_drbpn"}
+
+
+def test_the_sensors_of_the_faulty_simulator_fail_as_the_page_says():
+    done = subprocess.run(
+        [sys.executable, str(SIMULATOR)], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    shares = [float(share) for share in re.findall(r"in (0\.\d+) of the steps", done.stdout)]
+    late = 1 - (2 / 3) ** 3  # of 3 delays one at least brings a reading
+    started = 1 - 1.2 / 50  # nearly nothing arrives at the first two steps
+    stuck = 0.01 / 0.06 * (1 - (1 - 0.94**50) / (50 * 0.06))  # from sensors that all work
+    wanted = [0.25 * 0.8 * started, late * 0.8 * started, 0.8, stuck]
+    assert shares == pytest.approx(wanted, abs=0.02)
 
 
 @pytest.mark.slow

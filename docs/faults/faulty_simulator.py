@@ -40,7 +40,7 @@ class Carts(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         rows = None if tensordict is None else tensordict.get("_reset", None)
-        fresh = torch.randn_like(self.state)
+        fresh = 2 * torch.rand_like(self.state) - 1
         self.state = fresh if rows is None else torch.where(rows, fresh, self.state)
         return self._observe()
 
