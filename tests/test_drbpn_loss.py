@@ -261,19 +261,16 @@ def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
         action = frame["previous_action"].to(torch.float64)
         return oracles.predict(*belief, transition, Q, action)
 
-    episodes = 0
     for row in data.unbind(0):
         belief = None
         for t, frame in enumerate(row.unbind(0)):
             if frame["is_init"]:
                 belief = receive((model.initial_mean, model.initial_cov), frame)
-                episodes += 1
             elif t == 0:
                 stored = (frame["recurrent", "mean"], Q)
                 belief = receive(move(stored, frame), frame)
             belief = receive(move(belief, frame["next"]), frame["next"])
-    assert episodes > 3
-    return total.detach(), entries
+    return total, entries
 
 
 @pytest.mark.parametrize("length", [TIME, 12, 6, 1])
@@ -281,6 +278,7 @@ def test_every_received_observation_counts_once_however_the_rollout_is_cut(lengt
     agent, data = make_belief_agent(), make_data()
     assert data["next", "terminated"][:, :-1].any()
     assert data["next", "truncated"][:, :-1].any()
+    assert data["is_init"].sum() > 3
     expected, entries = counted(agent, data)
     loss = make_loss(agent, model=BeliefModelLoss(reduction="sum"))
     sequences = cut(data, length)
@@ -289,7 +287,7 @@ def test_every_received_observation_counts_once_however_the_rollout_is_cut(lengt
         out = loss(minibatch)
         total = total - out["loss_model"].detach()
         per_entry.append((out["loss_model"], out["log_likelihood"]))
-    torch.testing.assert_close(total, expected, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(total, expected.detach(), rtol=1e-10, atol=1e-10)
     counts = sum((-value / metric).item() for value, metric in per_entry)
     assert counts == pytest.approx(entries, abs=1e-6)
 
@@ -310,52 +308,17 @@ def test_the_next_observation_is_predicted_from_the_live_belief_with_its_gradien
     agent, data = make_belief_agent(), make_data()
     with torch.no_grad():
         for parameter in agent.belief.parameters():
-            parameter += 0.05  # no longer the filter that collected
+            parameter += 0.05  # not the filter that collected
     data = data[:1]
     data["is_init"][:, 0] = True
     data["recurrent", "age"][:, 0] = 0
-    expected, _ = counted_live(agent, data)
+    expected, _ = counted(agent, data)
     out = make_loss(agent, model=BeliefModelLoss(reduction="sum"))(data)
     torch.testing.assert_close(-out["loss_model"], expected, rtol=1e-10, atol=1e-10)
     for received, wanted in zip(
         gradients(agent, -out["loss_model"]), gradients(agent, expected), strict=True
     ):
         torch.testing.assert_close(received, wanted, rtol=1e-8, atol=1e-8)
-
-
-def counted_live(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
-    """The same sum with every frame in one long row and its gradient kept."""
-    model = agent.belief.filter
-    f = model.transition.mean_network()
-    transition = oracles.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)
-    frames, resets = [], []
-    for t, frame in enumerate(data[0].unbind(0)):
-        if frame["is_init"]:
-            frames.append(frame)
-            resets.append(True)
-        assert t > 0 or frame["is_init"]
-        frames.append(frame["next"])
-        resets.append(False)
-
-    def stack(key: str) -> torch.Tensor:
-        return torch.stack([frame[key] for frame in frames])[None]
-
-    out = oracles.filter_sequence(
-        observation=stack("observation"),
-        observed=stack("observed"),
-        previous_action=stack("previous_action").to(torch.float64),
-        reset=torch.tensor(resets)[None],
-        start_mean=torch.zeros(1, model.state_dim, dtype=torch.float64),
-        initial_mean=model.initial_mean,
-        initial_cov=model.initial_cov,
-        transition=transition,
-        transition_cov=model.transition.cov(),
-        matrix=model.emission.matrix,
-        noise=model.emission.cov(),
-        action_matrix=model.emission.action_matrix,
-        bias=model.emission.offset,
-    )
-    return out.log_likelihood.sum(), int(stack("observed").sum())
 
 
 def test_a_rollout_without_an_end_adds_nothing():

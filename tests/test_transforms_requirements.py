@@ -302,23 +302,16 @@ def test_specs_are_met_in_one_environment(case: Case, batched: bool) -> None:
 
 @every
 @pytest.mark.parametrize("where", ["inside", "outside"])
-def test_specs_are_met_with_a_serial_environment(case: Case, where: str) -> None:
+@pytest.mark.parametrize(
+    "workers",
+    [SerialEnv, pytest.param(parallel_env, marks=pytest.mark.slow)],
+    ids=["serial", "parallel"],
+)
+def test_specs_are_met_in_workers_and_outside_of_them(case: Case, workers: Any, where: str) -> None:
     if where == "inside":
-        env = SerialEnv(2, partial(corrupted_simulator, case))
+        env = workers(2, partial(corrupted_simulator, case))
     else:
-        env = case.env(SerialEnv(2, simulator))
-    check_env_specs(env)
-    env.close()
-
-
-@every
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["inside", "outside"])
-def test_specs_are_met_with_a_parallel_environment(case: Case, where: str) -> None:
-    if where == "inside":
-        env = parallel_env(2, partial(corrupted_simulator, case))
-    else:
-        env = case.env(parallel_env(2, simulator))
+        env = case.env(workers(2, simulator))
     try:
         check_env_specs(env)
     finally:

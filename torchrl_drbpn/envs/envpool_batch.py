@@ -37,7 +37,7 @@ class EnvPoolBatchEnv(SimulatorBatch):
       other first observations. Rewards are rounded to ``float32`` inside.
     - The seeds of EnvPool are fixed where the simulators are made. A new seed therefore makes them
       anew at the next reset, and every row has to be reset before the next step.
-    - A terminated row can not be stepped on: EnvPool would start the next episode unasked.
+    - A terminated row can not be stepped on: EnvPool would start the next episode.
     - The state can not be saved: :attr:`supports_state` is False, ``state_dict()`` is empty, and
       the caller has to start new episodes. A copy or a pickle starts new episodes too.
     - Resets of MuJoCo by itself can not be seen: :attr:`engine_resets` stays 0.
