@@ -17,6 +17,7 @@ import hydra
 import torch
 from evaluation.folders import override
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
@@ -33,12 +34,14 @@ from training.reward_scale import ReturnStatistics
 from training.run_folder import (
     RunLog,
     is_evaluated,
+    load_config,
     locked,
     resumed_config,
     write_config,
     write_versions,
 )
 from training.state import Training
+from training.sweep import continued, run_cell
 
 from torchrl_drbpn import BeliefDivergedError
 
@@ -176,12 +179,13 @@ def train(config: DictConfig, folder: Path) -> int:
             path = last_checkpoint(folder)
             training.load_state_dict(load_checkpoint(path), str(path))
             frames, evaluated = training.frames, training.evaluated_frames
-            if frames > config.total_frames:
+            # A run ends with a whole rollout, which may be past what was asked for.
+            if config.total_frames < min(frames, load_config(folder).total_frames):
                 raise UserError(
                     f"`total_frames` must be at least the {frames:,} that `{folder}` has been "
                     f"trained for, got {config.total_frames:,}."
                 )
-            if frames == config.total_frames and is_evaluated(folder, config):
+            if frames >= config.total_frames and is_evaluated(folder, config):
                 say(f"`{folder}` is at its end; more total_frames go on with it")
                 return 0
             if not training.env.base_env.supports_state:
@@ -249,7 +253,9 @@ def _loop(
     if training.seconds > first_seconds:
         speed = (training.frames - first) / (training.seconds - first_seconds)
         say(f"{speed:.0f} steps/s in collection and update, start-up and evaluation excluded")
-    if stop:
+    if stop and not training.frames:
+        say("stopped before the first rollout: nothing to go on with")
+    elif stop:
         say(f"stopped and saved; continue with {override('resume', folder)}")
     elif episodes := config.evaluation.final_episodes:
         rows = evaluate_training(config, training, "final", episodes, lambda: bool(stop))
@@ -290,15 +296,38 @@ def job(config: DictConfig) -> int:
     return train(config, folder)
 
 
+def cell(config: DictConfig) -> int:
+    """Run one job of a sweep, from wherever its folder stands.
+
+    Args:
+        config: what Hydra composed.
+
+    Returns:
+        The exit status.
+    """
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    wanted = continued(checked(config, command_line()), folder)
+    if wanted is None:
+        return 0
+    status = train(wanted, folder)
+    if not status:
+        say(f"{folder.name}: done")
+    return status
+
+
 @hydra.main(version_base="1.3", config_path="../conf", config_name="config")
-def main(config: DictConfig) -> None:
+def main(config: DictConfig) -> tuple[str, str] | None:
     """Start from the command line."""
-    status = explained(lambda: job(config))
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
+    outcome = run_cell(lambda: cell(config), folder) if sweeping else None
+    status = 0 if sweeping else explained(lambda: job(config))
     # Hydra makes the folder before any setting is looked at: leave none behind for a bad one.
     with contextlib.suppress(OSError):
-        Path(HydraConfig.get().runtime.output_dir).rmdir()
+        folder.rmdir()
     if status:
         sys.exit(status)
+    return outcome
 
 
 if __name__ == "__main__":

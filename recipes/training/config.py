@@ -27,6 +27,8 @@ from training.errors import UserError
 
 CONF = Path(__file__).parents[2] / "conf"
 GROUPINGS = ("sensor", "joint", "kind")
+# What ends in one line. A belief diverges where an agent's learned model runs open loop.
+EXPECTED = (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException)
 _USER_ERROR = 2
 
 # Least and greatest value of what no constructor checks.
@@ -339,8 +341,7 @@ def explained(job: Callable[[], int | None]) -> int:
     """
     try:
         return job() or 0
-    # Such as an agent without its sensors, whose learned model then runs open loop.
-    except (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException) as error:
+    except EXPECTED as error:
         sys.stderr.write(f"error: {explain(error)}\n")
         return _USER_ERROR
 

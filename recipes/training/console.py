@@ -6,11 +6,15 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, cast
+from typing import Any, ClassVar, Self, cast
 
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
+
+# Environment variable: a file whose presence asks every cell of a sweep to stop.
+STOP_FILE = "TORCHRL_DRBPN_STOP_FILE"
 
 
 def say(text: str) -> None:
@@ -61,21 +65,28 @@ class StopRequest:
     """Remember that a signal asked the run to stop, while this context is open.
 
     The first signal is remembered and nothing else happens, so that the run stops where its state
-    is whole: after the update of the current rollout. A second one ends the process as usual.
+    is whole: after the update of the current rollout. A second one ends the process as usual. One
+    inside another hands its signal on to it; a cell of a sweep also stops with its sweep, which
+    may be another process.
 
     Args:
-        patient: whether a second one is ignored instead.
+        file: made when the signal comes, for those that look for it.
     """
 
-    def __init__(self, *, patient: bool = False) -> None:
-        self.patient = patient
+    innermost: ClassVar[StopRequest | None] = None
+
+    def __init__(self, file: Path | None = None) -> None:
+        self.file = file
         self.signal: int | None = None
+        self._outer: StopRequest | None = None
+        self._sweep = os.environ.get(STOP_FILE)
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> StopRequest:
+    def __enter__(self) -> Self:
         """Take over both signals."""
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._remember)
+        self._outer, StopRequest.innermost = StopRequest.innermost, self
         return self
 
     def __exit__(
@@ -86,21 +97,28 @@ class StopRequest:
     ) -> None:
         """Give both signals back."""
         self._restore()
+        StopRequest.innermost = self._outer
 
     def __bool__(self) -> bool:
         """Return whether a stop was asked for."""
-        return self.signal is not None
+        return self.exit_code != 0
 
     @property
     def exit_code(self) -> int:
         """Return the shell's status for the signal: 130 for Ctrl-C, 143 for SIGTERM, else 0."""
-        return 0 if self.signal is None else 128 + self.signal
+        if self.signal is not None:
+            return 128 + self.signal
+        if self._outer is not None:
+            return self._outer.exit_code
+        return 128 + signal.SIGTERM if self._sweep and os.path.exists(self._sweep) else 0
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
-        del frame
         self.signal = number
-        if not self.patient:
-            self._restore()
+        self._restore()
+        if self.file is not None:
+            self.file.touch()
+        if self._outer is not None:
+            self._outer._remember(number, frame)
 
     def _restore(self) -> None:
         while self._before:

@@ -1,0 +1,338 @@
+"""Studies and methods: sweeps of Hydra whose cells are runs that can be killed at any moment.
+
+Every study and every method composes into runs without a key that no part reads. With the same
+settings a cell that is done is left as it is, one that was cut off goes on, one that was killed
+before its first checkpoint starts anew; other settings are refused. One that fails ends no other,
+whatever runs the cells: one after another, joblib, submitit.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("hydra")
+from recipe_tools import CONF, ROOT, command, differences, make_config, read_table, run  # isort: skip
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra_plugins.cell_sweeper import CellSweeper
+from omegaconf import DictConfig, OmegaConf
+from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
+from training.config import composed_config
+from training.console import STOP_FILE, StopRequest
+from training.errors import UserError
+from training.run_folder import write_config
+from training.sweep import continued, run_cell
+
+STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
+METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+OVERLAYS = ("experiment", "study", "method")
+BRIEF = ("experiment=smoke", "total_frames=256", "evaluation.every_frames=0")
+# Long enough to be caught while it runs; it saves only at its end.
+LONG = (*BRIEF[::2], "total_frames=1_000_000", "optim.epochs=1")
+
+
+# What stands in conf --------------------------------------------------------------------------
+
+
+def compose(words: Sequence[str]) -> DictConfig:
+    """Compose a configuration, what Hydra says of its job included."""
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return hydra.compose("config", list(words), return_hydra_config=True)
+
+
+def cells(study: str, *words: str) -> list[DictConfig]:
+    """Compose the first cell of ``--multirun study=... <words>``, and those one word apart."""
+    base = compose([f"study={study}", *words])
+    params = [f"{key}={value}" for key, value in base.hydra.sweeper.params.items()]
+    assert params[0].startswith("seed=")  # one seed of everything before the second of anything
+    parsed = OverridesParser.create().parse_overrides([*params, f"study={study}", *words])
+    (listed,) = CellSweeper.split_arguments(parsed, None)
+    near = [each for each in listed if len({*each} - {*listed[0]}) < 2]
+    return [compose(each) for each in near]
+
+
+def folder_of(cell: DictConfig) -> Path:
+    HydraConfig.instance().set_config(cell)
+    return Path(cell.hydra.sweep.dir) / cell.hydra.sweep.subdir
+
+
+def keys(node: Any, path: str = "") -> set[str]:
+    if not isinstance(node, dict):
+        return {path}
+    return {path}.union(*(keys(node[key], f"{path}.{key}") for key in node if key != "hydra"))
+
+
+def assert_no_unknown_key(config: DictConfig) -> None:
+    """An overlay may add a key by a slip of the pen; what the groups hold is all that is read."""
+    choices = config.hydra.runtime.choices
+    names = sorted(path.name for path in CONF.iterdir() if path.is_dir())
+    groups = tuple(f"{name}={choices[name]}" for name in names if name not in OVERLAYS)
+    assert keys(OmegaConf.to_container(config)) == _keys(groups)
+
+
+@functools.cache
+def _keys(groups: tuple[str, ...]) -> set[str]:
+    return keys(OmegaConf.to_container(compose(groups)))
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_every_cell_of_a_study_is_a_run_in_a_folder_of_its_own(study: str) -> None:
+    every = cells(study)
+    names = [folder_of(cell) for cell in every]
+    assert len(set(names)) == len(names)
+    assert {name.parent for name in names} == {Path("runs") / study}
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+-s\d", name.name) for name in names)
+    for cell in every:
+        assert_no_unknown_key(cell)
+    composed_config([f"study={study}"])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_is_a_belief_with_its_settings_under_its_name(method: str) -> None:
+    config = compose([f"method={method}"])
+    assert config.method == method
+    assert config.hydra.runtime.choices.belief in (method, "drbpn", "none")
+    assert_no_unknown_key(config)
+    composed_config([f"method={method}", "experiment=thorough"])
+
+
+def test_the_command_line_wins_over_a_study_and_a_method() -> None:
+    given = ("seed=7", "env=ant", "method=dvrl", "total_frames=200_000", "optim.lr=1e-4")
+    (cell,) = cells("robust", *given, "hydra.sweep.dir=elsewhere")
+    assert (cell.seed, cell.env.id, cell.belief.name) == (7, "Ant", "dvrl")
+    assert (cell.total_frames, cell.optim.lr) == (200_000, 1e-4)
+    assert (cell.env.version, cell.optim.minibatches) == ("v4", 16)  # of the study, its experiment
+    assert folder_of(cell) == Path("elsewhere/Ant-dvrl-s7")
+
+
+# A cell and its folder ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sweep") / "cell"
+    assert run(folder, *BRIEF) == 0
+    return folder
+
+
+def test_a_cell_that_is_done_is_left_as_it_is(
+    done: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in done.rglob("*") if path.suffix}
+    assert continued(make_config(*BRIEF), done) is None
+    assert capsys.readouterr().out == "cell: done already, left as it is\n"
+    assert {path: path.stat().st_mtime_ns for path in done.rglob("*") if path.suffix} == before
+
+
+@pytest.mark.parametrize("lacking", ["steps", "more steps are wanted", "final evaluation"])
+def test_a_cell_that_was_cut_off_goes_on(done: Path, tmp_path: Path, lacking: str) -> None:
+    folder = shutil.copytree(done, tmp_path / "cell")
+    words = list(BRIEF)
+    if lacking == "steps":
+        words[1] = "total_frames=512"
+        write_config(folder, make_config(*words))
+    elif lacking == "more steps are wanted":
+        words[1] = "total_frames=384"
+    else:
+        (folder / "evaluation.csv").unlink()
+    config = continued(make_config(*words), folder)
+    assert config is not None
+    assert config.resume == str(folder)
+
+
+def test_a_cell_that_rounds_its_steps_up_to_a_rollout_is_done_at_its_end(tmp_path: Path) -> None:
+    words = (BRIEF[0], "total_frames=200", BRIEF[2])
+    assert run(tmp_path / "cell", *words) == 0
+    assert checkpoint_frames(tmp_path / "cell") == 256
+    assert continued(make_config(*words), tmp_path / "cell") is None
+    (tmp_path / "cell" / "evaluation.csv").unlink()  # killed in its final evaluation
+    config = continued(make_config(*words), tmp_path / "cell")
+    from ppo_drbpn import train
+
+    assert config is not None
+    assert train(config, tmp_path / "cell") == 0
+    assert len(read_table(tmp_path / "cell" / "evaluation.csv")) == 2
+
+
+def test_a_cell_that_was_killed_before_its_first_checkpoint_starts_anew(
+    done: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(done, tmp_path / "cell")
+    shutil.rmtree(folder / "checkpoints")
+    with (folder / "metrics.csv").open("a") as file:
+        file.write("384,1.")
+    config = continued(make_config(*BRIEF), folder)
+    assert config is not None
+    assert config.resume is None
+    assert run(folder, *BRIEF) == 0
+    assert read_table(folder / "metrics.csv") == read_table(done / "metrics.csv")
+
+
+def test_another_configuration_in_the_folder_of_a_cell_is_refused(done: Path) -> None:
+    with pytest.raises(UserError, match=r"other settings \(seed, optim.lr\): name another folder"):
+        continued(make_config(*BRIEF, "seed=1", "optim.lr=0.1"), done)
+    with pytest.raises(UserError, match="`resume` continues one run"):
+        continued(make_config(*BRIEF, "resume=x"), done)
+
+
+def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken() -> int:
+        raise RuntimeError("two\nlines")
+
+    assert run_cell(broken, tmp_path / "cell") == ("cell", "RuntimeError: two lines")
+    assert "cell: error: RuntimeError: two lines\n" in capsys.readouterr().err
+    assert run_cell(lambda: 0, tmp_path / "cell") == ("cell", "")
+    monkeypatch.setenv(STOP_FILE, str(tmp_path / "stop"))
+    with StopRequest(tmp_path / "stop"):
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert run_cell(broken, tmp_path / "cell") == ("cell", "stopped")
+
+
+# Sweeps ---------------------------------------------------------------------------------------
+
+
+def same_run(first: Path, second: Path) -> bool:
+    states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
+    return not differences(*states) and all(
+        read_table(first / table) == read_table(second / table)
+        for table in ("metrics.csv", "evaluation.csv")
+    )
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cells one after another: one that diverges, one that is refused, one that is well."""
+    folder = tmp_path_factory.mktemp("swept")
+    words = ("optim.lr=1e30,-1,1e-3", "hydra.sweep.dir=out", "belief=none")
+    answer = command("ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=folder)
+    (folder / "answer").write_text(answer.stdout)
+    assert answer.returncode == 1, answer.stderr
+    return folder
+
+
+def out(folder: Path, rate: str) -> Path:
+    (found,) = (folder / "out").glob(f"*lr-{rate}*")
+    return found
+
+
+@pytest.mark.slow
+def test_a_cell_that_fails_or_is_refused_ends_no_other_and_is_listed(swept: Path) -> None:
+    said = (swept / "answer").read_text()
+    assert "1 of 3 cells are done: out\n" in said
+    failed = re.findall(r"^failed: \S+: (.*)$", said, re.MULTILINE)
+    assert len(failed) == 2
+    assert failed[0].startswith("training stopped at ")
+    assert "lr" in failed[1].lower()
+    assert checkpoint_frames(out(swept, "0.001")) == 256
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_launchers_run_the_same_cells_to_the_same_bit(
+    swept: Path, tmp_path: Path, launcher: str
+) -> None:
+    pytest.importorskip(launcher.split("_")[0])
+    words = ("optim.lr=1e-3,-1", "hydra.sweep.dir=out", "belief=none", f"hydra/launcher={launcher}")
+    answer = command("ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=tmp_path)
+    assert answer.returncode == 1, answer.stderr
+    assert "1 of 2 cells are done: out\n" in answer.stdout
+    assert same_run(out(swept, "0.001"), out(tmp_path, "0.001"))
+    if launcher == "joblib":
+        assert "Done   2 out of   2" in answer.stderr
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start a sweep in a process group of its own; nothing of it is left at the end."""
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(*words: str) -> subprocess.Popen[str]:
+        line = [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), "--multirun", *words]
+        started.append(
+            subprocess.Popen(
+                [*line, "study=smoke", "hydra.sweep.dir=out"], cwd=tmp_path,
+                stdout=subprocess.PIPE, text=True, start_new_session=True,
+            )
+        )  # fmt: skip
+        return started[-1]
+
+    yield begin
+    for process in started:
+        try:
+            os.killpg(process.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            continue
+
+
+def wait_for_rows(folder: Path, cells: int) -> None:
+    deadline = time.monotonic() + 240
+    while sum(p.read_text().count("\n") > 2 for p in folder.glob("out/*/metrics.csv")) < cells:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("launcher", "at_once"), [("basic", 1), ("joblib", 2)])
+@pytest.mark.parametrize("how", ["Ctrl-C", "SIGTERM"])
+def test_a_signal_stops_a_sweep_and_every_cell_is_saved(
+    start: Callable[..., subprocess.Popen[str]],
+    tmp_path: Path,
+    launcher: str,
+    at_once: int,
+    how: str,
+) -> None:
+    """Ctrl-C reaches every process of the terminal, SIGTERM the sweep alone."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = (*LONG[1:], f"hydra/launcher={launcher}", "seed=0", "method=none,drbpn,gru")
+    process = start(*words, *(["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []))
+    wait_for_rows(tmp_path, at_once)
+    if how == "Ctrl-C":
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        process.send_signal(signal.SIGTERM)
+    said, _ = process.communicate(timeout=240)
+    assert process.returncode == (130 if how == "Ctrl-C" else 143), said
+    assert "0 of 3 cells are done" in said
+    assert said.count("\nstopped: ") == 3
+    folders = sorted((tmp_path / "out").glob("Inv*"))
+    assert len(folders) == at_once
+    for folder in folders:
+        rows = read_table(folder / "metrics.csv")
+        assert checkpoint_frames(folder) == int(rows[-1]["frames"])
+    assert not list((tmp_path / "out").glob(".stop*"))
+
+
+@pytest.mark.slow
+def test_a_sweep_goes_on_after_it_was_killed(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
+) -> None:
+    words = (*LONG[1:], "seed=0", "method=none", "checkpoint.every_frames=128")
+    process = start(*words)
+    wait_for_rows(tmp_path, 1)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    (folder,) = (tmp_path / "out").glob("Inv*")
+    reached = checkpoint_frames(folder) or 0
+    total = reached + 256
+    again = start(*words, f"total_frames={total}")
+    said, _ = again.communicate(timeout=240)
+    assert again.returncode == 0, said
+    assert f"going on at {reached:,} steps" in said
+    frames = [int(row["frames"]) for row in read_table(folder / "metrics.csv")]
+    assert frames == list(range(128, total + 1, 128))  # no rollout is missing, none is there twice
