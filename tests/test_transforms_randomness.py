@@ -22,10 +22,14 @@ from torchrl.envs import Compose, DoubleToFloat, GymEnv, ParallelEnv, SerialEnv,
 
 from torchrl_drbpn.functional.missingness import missing_probability, sample_mask
 from torchrl_drbpn.transforms import (
+    ObservationDelay,
     ObservationMissingness,
+    ObservationMultiRate,
     ObservationNoise,
     ObservationSpikes,
+    SensorDrift,
     SensorOutages,
+    StuckSensors,
     seed_env,
 )
 
@@ -129,8 +133,11 @@ def test_forked_workers_that_set_seed_does_not_reach_differ_too():
         partial(ObservationNoise, 0.1),
         partial(ObservationSpikes, 0.5, 1.0),
         partial(SensorOutages, 0.5, 3),
+        partial(ObservationDelay, 0, max_delay=3),
+        partial(ObservationMultiRate, 3, phase="random"),
+        partial(SensorDrift, 0.1),
     ],
-    ids=["missingness", "noise", "spikes", "outages"],
+    ids=["missingness", "noise", "spikes", "outages", "delay", "rates", "drift"],
 )
 def test_without_a_seed_two_transforms_differ_and_the_global_seed_repeats_them(make):
     def draw(transform, seed=None):
@@ -178,6 +185,9 @@ def test_a_seed_always_stands_for_the_same_numbers(make, stream, draw):
 
 
 def test_classes_with_the_same_seed_are_unrelated():
+    kinds = [ObservationNoise, ObservationMissingness, SensorOutages, ObservationSpikes]
+    kinds += [ObservationDelay, ObservationMultiRate, StuckSensors, SensorDrift]
+    assert len({kind.stream for kind in kinds}) == len(kinds)
     zeros = TensorDict({"observation": torch.zeros(8000, OBS)}, [8000])
     drawn = [
         ObservationNoise(1.0, seed=5)._call(zeros.clone())["observation"].double(),
