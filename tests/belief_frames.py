@@ -33,12 +33,16 @@ class BeliefFrames:
         return (self.observation, "observed", "previous_action", "is_init")
 
     def make_frames(
-        self, shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0
+        self,
+        shape: tuple[int, ...],
+        dtype: torch.dtype = torch.float32,
+        seed: int = 0,
+        obs: int = OBS,
     ) -> TensorDict:
         """Return what the environment writes, nowhere an episode start."""
         g = torch.Generator().manual_seed(seed)
-        observed = torch.rand(*shape, OBS, generator=g) < 0.6
-        observation = torch.randn(*shape, OBS, generator=g, dtype=dtype)
+        observed = torch.rand(*shape, obs, generator=g) < 0.6
+        observation = torch.randn(*shape, obs, generator=g, dtype=dtype)
         return TensorDict(
             {
                 self.observation: torch.where(observed, observation, 0.0),

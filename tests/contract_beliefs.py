@@ -216,15 +216,6 @@ class BeliefModuleContract(BeliefFrames):
         self.assert_same(module, self.as_sequence(module, dirty), rollout)
         self.assert_same(module, module(dirty.select(*module.in_keys)), rollout)
 
-    def test_the_age_counts_updates_since_the_reset(self):
-        module = self.make_module()
-        frames = self.make_frames((1, 6))
-        frames["is_init"][:, [0, 4]] = True
-        rollout = self.one_by_one(module, frames, None)
-        assert rollout[self.age_key].flatten().tolist() == [0, 1, 2, 3, 0, 1]
-        following = rollout["next"][self.age_key].flatten()
-        assert following.tolist() == [1, 2, 3, 4, 1, 2]
-
     @pytest.mark.parametrize("over_time", [False, True])
     def test_without_recurrent_entries_rows_start_from_the_initial_state_with_one_warning(
         self, over_time

@@ -1,8 +1,8 @@
-"""What `BeliefFilterModule` is held to: the duties of a belief module, its own keys, bad input."""
+"""`BeliefFilterModule`: the requirements of a belief module, its own keys, bad input."""
 
 from __future__ import annotations
 
-from typing import Any
+import functools
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from contracts import ACTION, OBS, BeliefModuleContract
 from tensordict import TensorDict, TensorDictBase
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn import BeliefFilter, BeliefFilterModule, functional
+from torchrl_drbpn import BeliefFilterModule, functional
 
 OPTIONAL = (
     ("belief", "cov"),
@@ -21,28 +21,8 @@ OPTIONAL = (
 )
 
 
-def make_filter(
-    obs: int = OBS, action: int = ACTION, dtype: torch.dtype | None = None, **kwargs: Any
-) -> BeliefFilter:
-    return make_any_filter(obs, action, dtype, **kwargs)
-
-
-def make_frames(
-    shape: tuple[int, ...], obs: int = OBS, dtype: torch.dtype = torch.float64, seed: int = 0
-) -> TensorDict:
-    """What an environment writes; nowhere an episode start."""
-    g = torch.Generator().manual_seed(seed)
-    observed = torch.rand(*shape, obs, generator=g) < 0.6
-    observation = torch.randn(*shape, obs, generator=g, dtype=dtype)
-    return TensorDict(
-        {
-            "observation": torch.where(observed, observation, 0.0),
-            "observed": observed,
-            "previous_action": torch.randn(*shape, ACTION, generator=g, dtype=dtype),
-            "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
-        },
-        shape,
-    )
+make_filter = functools.partial(make_any_filter, OBS, ACTION)
+make_frames = functools.partial(BeliefModuleContract().make_frames, dtype=torch.float64)
 
 
 def with_state(frames: TensorDict, state: int) -> TensorDict:
@@ -54,12 +34,12 @@ def with_state(frames: TensorDict, state: int) -> TensorDict:
     return frames.clone().set("recurrent", TensorDict({"mean": mean, "age": age}, shape))
 
 
-# ------------------------------------------------------------------------------------------- duties
+# ------------------------------------------------------------------------------------- requirements
 class TestContract(BeliefModuleContract):
     all_outputs = ("features", ("belief", "log_likelihood"), *OPTIONAL)
 
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        return BeliefFilterModule(make_filter(obs, action, dtype), **kwargs)
+        return BeliefFilterModule(make_any_filter(obs, action, dtype), **kwargs)
 
     def differentiable(self, out: TensorDictBase) -> torch.Tensor:
         return out["features"].square().mean() - out["belief", "log_likelihood"].mean()
@@ -71,7 +51,7 @@ class TestContractOfTheInformationForm(TestContract):
     test_it_runs_in_batched_environments = None  # once is enough
 
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        belief = make_filter(obs, action, dtype, state=3)
+        belief = make_any_filter(obs, action, dtype, state=3)
         return BeliefFilterModule(belief, policy_input="mean_cov", **kwargs)
 
 
@@ -81,7 +61,7 @@ class TestContractOfANetworkCovariance(TestContract):
     test_it_runs_in_batched_environments = None  # once is enough
 
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        belief = make_filter(obs, action, dtype, state=3, cov_network=True)
+        belief = make_any_filter(obs, action, dtype, state=3, cov_network=True)
         return BeliefFilterModule(belief, **kwargs)
 
 
@@ -177,7 +157,7 @@ def test_optional_entries_equal_the_textbook(state, cov_network, over_time):
 
 def test_an_innovation_covariance_has_the_digits_of_innovation():
     # H P H' is some 1e4 beside an R of 1e-4: float32 would keep nothing of it
-    model = make_filter(obs=9, state=3)
+    model = make_any_filter(9, ACTION, state=3)
     with torch.no_grad():
         model.emission.matrix *= 30.0
     module = BeliefFilterModule(model, out_keys=[("belief", "innovation_cov")])
@@ -247,7 +227,7 @@ def test_another_policy_input_is_refused(policy_input):
 def test_autocast_leaves_the_filter_in_its_own_dtype():
     """Half precision would lose the filter's digits; what PyTorch casts are the other networks."""
     written = ["features", ("belief", "log_likelihood"), ("belief", "observation")]
-    module = BeliefFilterModule(make_filter(obs=9), out_keys=written)
+    module = BeliefFilterModule(make_any_filter(9, ACTION), out_keys=written)
     data = make_frames((3, 6), obs=9, dtype=torch.float32)
     data["is_init"][:, 0] = True
 

@@ -1,7 +1,7 @@
-"""Transforms and normalisation know nothing of the filter: TorchRL's SAC learns with them.
+"""Transforms and normalisation work without a filter: TorchRL's SAC learns with them.
 
 A short real run on InvertedPendulum-v5: collector, replay buffer, SACLoss, SoftUpdate. What the
-buffer holds is what the sensors gave, in raw units: a missing entry is 0, or the last value that
+buffer holds is what arrived, in raw units: a missing entry is 0, or the last value that
 arrived where it is filled, at the root of a transition as in its next step. The normalisation is
 first in the policy, learns from each collected batch once, and is applied to what is sampled.
 """
@@ -46,37 +46,28 @@ def make_env(last: list[Transform]) -> EnvBase:
 
 
 def make_networks() -> tuple[ProbabilisticActor, ValueOperator]:
-    # the policy reads which entries arrived as well
-    class Head(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.net = nn.Sequential(
-                nn.Linear(2 * OBS, 32), nn.ReLU(), nn.Linear(32, 2 * ACTION), NormalParamExtractor()
-            )
+    class Network(nn.Sequential):
+        """Reads which entries arrived as well."""
 
-        def forward(self, observation, observed):
-            return self.net(torch.cat([observation, observed.to(observation.dtype)], -1))
+        def forward(self, *parts):
+            return super().forward(torch.cat([part.float() for part in parts], -1))
 
-    class Value(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.net = nn.Sequential(nn.Linear(2 * OBS + ACTION, 32), nn.ReLU(), nn.Linear(32, 1))
-
-        def forward(self, observation, observed, action):
-            return self.net(torch.cat([observation, observed.to(observation.dtype), action], -1))
-
+    policy = Network(
+        nn.Linear(2 * OBS, 32), nn.ReLU(), nn.Linear(32, 2 * ACTION), NormalParamExtractor()
+    )
+    value = Network(nn.Linear(2 * OBS + ACTION, 32), nn.ReLU(), nn.Linear(32, 1))
     actor = ProbabilisticActor(
-        TensorDictModule(Head(), ["normalized_observation", "observed"], ["loc", "scale"]),
+        TensorDictModule(policy, ["normalized_observation", "observed"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": -3.0, "high": 3.0},
         return_log_prob=False,
     )
-    return actor, ValueOperator(Value(), in_keys=["normalized_observation", "observed", "action"])
+    return actor, ValueOperator(value, in_keys=["normalized_observation", "observed", "action"])
 
 
 @pytest.mark.parametrize("missing", ["zero", "keep"])
-def test_sac_learns_from_what_the_sensors_gave(missing):
+def test_sac_learns_from_corrupted_observations(missing):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         filling = [FillLastObserved(fill_value=float("nan"))] if missing == "keep" else []
