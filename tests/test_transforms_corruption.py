@@ -231,6 +231,13 @@ def test_each_row_may_lack_sensors_of_its_own():
     assert torch.equal(env.rollout(3)["next", "observed"], (~rows).unsqueeze(1).expand(4, 3, OBS))
 
 
+def test_data_from_outside_an_environment_are_checked_at_every_call():
+    reduction = SensorReduction([0])
+    reduction(data())
+    with pytest.raises(ValueError, match=r"`observed` must be bool of shape .* = \(4, 5\)"):
+        reduction(data(observed=torch.ones(4, 1, dtype=torch.bool)))
+
+
 @pytest.mark.parametrize("shape", [(3, OBS), (1, OBS), (2, 4, OBS)])
 def test_rows_for_another_batch_are_refused(shape):
     rows = torch.zeros(shape, dtype=torch.bool)
