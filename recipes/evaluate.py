@@ -8,60 +8,45 @@ with its 95 % interval over the nominal and the realised missing ratio.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
+import joblib
 import pandas as pd
 from analysis.figures import draw_evaluation
 from analysis.runs import EPISODE_TABLES
 from evaluation.conditions import Condition, default_conditions, parse_conditions
 from evaluation.folders import find_folders, with_checkpoint
 from evaluation.sensor_choice import kept_sensors
-from evaluation.table import Protocol, Table, evaluate_tasks, identity
+from evaluation.table import Protocol, Table, evaluate_tasks
 from evaluation.trained import TrainedAgent, load_trained_agent
-from omegaconf import DictConfig
-from rendering.belief_figure import save_figure
-from training.config import check_mode
-from training.console import say, start
+from rendering.style import save_figure
+from training.config import check_mode, command
+from training.console import say
 from training.errors import UserError
 from training.sensors import have_names
 
 
 def run(config: dict[str, Any]) -> int:
-    """Evaluate what is not yet in the table, write it, and draw it.
-
-    Args:
-        config: see conf/evaluate.yaml.
-
-    Returns:
-        The exit status.
-    """
+    """Evaluate what is not yet in the table, write it, and draw it; see conf/evaluate.yaml."""
     folders, protocol = find_folders(config["run"]), _protocol(config)
     names = [folder.name for folder in folders]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(
             f"`run` must name folders with different names, {', '.join(twice)} comes twice: "
-            "evaluate them by themselves."
+            "evaluate each of them by itself."
         )
     output, folders = _output(config, folders), with_checkpoint(folders)
     agents = {folder: load_trained_agent(folder, protocol.gate) for folder in folders}
     wanted = [(f, condition) for f in folders for condition in _conditions(config, f, agents[f])]
-    table = Table(
-        output,
-        protocol,
-        {folder.name: identity(agent) for folder, agent in agents.items()},
-        overwrite=config["overwrite"],
-    )
+    named = {folder.name: agent for folder, agent in agents.items()}
+    table = Table(output, protocol, named, overwrite=config["overwrite"])
     lacking = [(f, c, table.lacks(f.name, c, config["modes"])) for f, c in wanted]
     tasks = [task for task in lacking if task[2]]
     if len(tasks) < len(wanted):
         say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
-    # macOS does not tell how many cores a process may use.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    processes = config["processes"] or cores or 1
+    processes = config["processes"] or joblib.cpu_count()
     for done, (task, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
         table.add(rows)
         say(f"{done}/{len(tasks)} {task[0].name} {task[1].name}: {_summary(rows)}")
@@ -136,11 +121,5 @@ def _summary(rows: Sequence[dict[str, Any]]) -> str:
     return ", ".join(parts)
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
-def main(config: DictConfig) -> None:
-    """Start from the command line."""
-    start(run, config)
-
-
 if __name__ == "__main__":
-    main()
+    command("evaluate", run)

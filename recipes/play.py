@@ -8,35 +8,37 @@ alone.
 
 from __future__ import annotations
 
+import importlib.util
+from math import inf
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
 from evaluation.conditions import parse_condition, removed_sensors
 from evaluation.trained import load_trained_agent
-from omegaconf import DictConfig
-from rendering.belief_figure import chosen_sensors, draw_belief, save_figure
+from rendering.belief_figure import chosen_sensors, draw_belief
+from rendering.style import save_figure
 from rendering.trajectory import record_episode
-from rendering.video import Film, check_video, robot_size, write_video
-from training.config import check_mode
-from training.console import say, start
+from rendering.video import Film, robot_size, write_video
+from training.config import check_mode, command
+from training.console import say
 from training.errors import UserError
 
-_FORMATS = (".gif", ".mp4", ".png")
-_RANGES = {"size": (240, 1920), "colours": (8, 256)}
+_RANGES = {
+    "start": (0, inf),
+    "steps": (1, inf),
+    "every": (1, inf),
+    "window": (2, inf),
+    "frames": (0, inf),
+    "size": (240, 1920),
+    "colours": (8, 256),
+    "fps": (1, 50),  # a GIF counts in hundredths of a second
+}
 _STRIP = (248, 330)  # pixels of a picture of the robot above the panels of a figure
 
 
 def run(config: dict[str, Any]) -> int:
-    """Record an episode and show it.
-
-    Args:
-        config: see conf/play.yaml.
-
-    Returns:
-        The exit status.
-    """
+    """Record an episode and show it; see conf/play.yaml."""
     out, first = _check(config), config["start"]
     torch.set_num_threads(config["threads"])
     trained = load_trained_agent(Path(config["run"]))
@@ -45,14 +47,12 @@ def run(config: dict[str, Any]) -> int:
     still = out.suffix == ".png"
     # Panels of the first frame of a film look back too.
     begin = first if still else max(0, first - config["window"] + 1)
-    removed = removed_sensors(
-        condition, trained, episodes=1, reduction_seed=config["reduction_seed"]
-    )
+    seed = config["reduction_seed"]
     size = _STRIP if still else robot_size(config["size"])
     recording = record_episode(
         trained,
         condition,
-        removed,
+        removed_sensors(condition, trained, episodes=1, reduction_seed=seed),
         mode=config["mode"],
         seed=config["seed"],
         start=begin,
@@ -67,26 +67,18 @@ def run(config: dict[str, Any]) -> int:
         )
     sensors = chosen_sensors(recording, config["sensors"])
     shown = f"{condition.name}{', as in training' if text == 'trained' else ''}"
-    belief = trained.settings.belief.get("name")
+    title = f"{recording.task}, {trained.settings.belief.get('name')}, {shown}"
     if still:
-        after = f"after {trained.frames:,} training steps, {config['mode']} actions"
-        title = f"{recording.task}, {belief}, {shown}, {after}"
+        title += f", after {trained.frames:,} training steps, {config['mode']} actions"
         figure = draw_belief(recording, sensors, pictures=config["frames"], title=title)
         save_figure(figure, out, dpi=120)
-        what = (
-            f"the 95 % intervals hold {100 * recording.coverage:.1f} % of the missing entries"
-            if recording.told == "estimate" and recording.coverage >= 0
-            else "one figure"
-        )
+        coverage = 100 * recording.coverage
+        what = "one figure"
+        if recording.kind == "estimate" and coverage >= 0:
+            what = f"the 95 % intervals hold {coverage:.1f} % of the missing entries"
     else:
-        film = Film(
-            recording,
-            sensors,
-            steps=steps,
-            window=config["window"],
-            width=config["size"],
-            title=f"{recording.task}  {belief}  {shown}",
-        )
+        look = {"window": config["window"], "width": config["size"], "title": title}
+        film = Film(recording, sensors, steps=steps, **look)
         write_video(out, film, fps=config["fps"], colours=config["colours"])
         what = f"{len(film)} frames of {film.width} x {film.height}"
     missing = 1 - recording.observed[steps.start :].mean()
@@ -101,10 +93,6 @@ def _check(config: dict[str, Any]) -> Path:
     """Refuse what can't be shown, before an agent is loaded; return where it goes."""
     if config["run"] is None or not Path(config["run"]).is_dir():
         raise UserError(f"`run` must name a run folder: run=runs/<folder>, got {config['run']}.")
-    least = {"steps": 1, "every": 1, "window": 2, "start": 0, "frames": 0}
-    for name, value in least.items():
-        if config[name] < value:
-            raise UserError(f"`{name}` must be {value} or more, got {config[name]}.")
     for name, (low, high) in _RANGES.items():
         if not low <= config[name] <= high:
             raise UserError(f"`{name}` must be in [{low}, {high}], got {config[name]}.")
@@ -112,18 +100,15 @@ def _check(config: dict[str, Any]) -> Path:
     out = Path(config["out"] or Path(config["run"]) / "play.gif")
     if not out.parent.is_dir():
         raise UserError(f"`out` must lie in an existing folder, got {out}.")
-    if out.suffix not in _FORMATS:
+    if out.suffix not in (".gif", ".mp4", ".png"):
         raise UserError(f"`out` must end in .gif, .mp4 or .png, got {out.name}.")
-    if out.suffix != ".png":
-        check_video(out, config["fps"])
+    if out.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise UserError(
+            "`out` as .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or take "
+            f"{out.with_suffix('.gif').name}."
+        )
     return out
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="play")
-def main(config: DictConfig) -> None:
-    """Start from the command line."""
-    start(run, config)
-
-
 if __name__ == "__main__":
-    main()
+    command("play", run)

@@ -12,16 +12,15 @@ import glob
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pandas as pd
 from analysis.figures import learning_curves, robustness
 from analysis.page import page
 from analysis.runs import Study, read_runs, write_table
 from analysis.tables import derived_tables
 from evaluation.folders import find_folders
-from omegaconf import DictConfig
-from rendering.belief_figure import save_figure
-from training.console import say, start
+from rendering.style import save_figure
+from training.config import command
+from training.console import say
 from training.errors import UserError
 from training.run_folder import write_whole
 
@@ -29,14 +28,7 @@ NOTES_FILE = "notes.md"
 
 
 def run(config: dict[str, Any]) -> int:
-    """Write a study from its runs, or the pages of studies from their tables.
-
-    Args:
-        config: see conf/report.yaml.
-
-    Returns:
-        The exit status.
-    """
+    """Write a study from its runs, or pages from tables alone; see conf/report.yaml."""
     if config["from"] is not None:
         if config["run"] is not None or config["out"] is not None:
             raise UserError(
@@ -102,11 +94,5 @@ def _replace(path: Path, content: Any) -> None:
         save_figure(content, path, dpi=80, palette=True)
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="report")
-def main(config: DictConfig) -> None:
-    """Start from the command line."""
-    start(run, config)
-
-
 if __name__ == "__main__":
-    main()
+    command("report", run)

@@ -12,14 +12,11 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pandas as pd
 from evaluation.folders import override
 from evaluation.trained import TrainedAgent, load_trained_agent, save_weights
-from omegaconf import DictConfig
-from training.config import missingness_name
-from training.console import say, start
-from training.envs import env_name
+from training.config import command
+from training.console import say
 from training.errors import UserError
 from training.run_folder import load_config, write_config, write_whole
 
@@ -27,14 +24,7 @@ _SHOWN = ["mode", "episodes", "return_mean", "return_std", "length_mean", "missi
 
 
 def run(config: dict[str, Any]) -> int:
-    """Save the agent of a run.
-
-    Args:
-        config: see conf/save_agent.yaml.
-
-    Returns:
-        The exit status.
-    """
+    """Save the agent of a run; see conf/save_agent.yaml."""
     for name in ("run", "out"):
         if config[name] is None:
             raise UserError(f"`{name}` must name a folder: run=<run folder> out=agents/walker2d.")
@@ -70,25 +60,25 @@ def _versions(folder: Path) -> dict[str, str]:
 
 
 def _card(trained: TrainedAgent, table: pd.DataFrame, versions: dict[str, str], out: Path) -> str:
-    settings, task = trained.settings, env_name(trained.settings)
+    own = trained.columns()
     commit = versions.get("git_commit", "unknown")
     if versions.get("git_uncommitted_changes") == "True":
         commit += ", with uncommitted changes"
     packages = ("torchrl_drbpn", "torch", "torchrl", "gymnasium", "mujoco")
     rows = {
-        "task": task,
-        "method": trained.method,
-        "missing in training": missingness_name(settings.missingness),
-        "noise in training, sigma": f"{settings.noise.sigma:g}",
-        "environment steps": f"{trained.frames:,}",
-        "seed": settings.seed,
+        "task": own["task"],
+        "method": own["method"],
+        "missing in training": own["trained_on"],
+        "noise in training, sigma": f"{own['noise_sigma']:g}",
+        "environment steps": f"{own['frames']:,}",
+        "seed": own["training_seed"],
         "commit": commit,
         "versions": ", ".join(f"{name} {versions.get(name, 'unknown')}" for name in packages),
     }
     shown = table[_SHOWN].to_markdown(index=False, floatfmt=".6g")
     return "\n".join(
         [
-            f"# {task}, {trained.method}",
+            f"# {own['task']}, {own['method']}",
             *("", "```bash", f"python recipes/play.py {override('run', out)}", "```", ""),
             *("| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())),
             "",
@@ -103,11 +93,5 @@ def _card(trained: TrainedAgent, table: pd.DataFrame, versions: dict[str, str], 
     )
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="save_agent")
-def main(config: DictConfig) -> None:
-    """Start from the command line."""
-    start(run, config)
-
-
 if __name__ == "__main__":
-    main()
+    command("save_agent", run)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -29,3 +29,30 @@ def _global_state() -> Iterator[None]:
     with torch.random.fork_rng(devices=[]):
         yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def trained_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Run folders after one rollout with two fifths missing, each made once: not to be written."""
+    from recipe_tools import make_folder
+
+    made: dict[tuple[str, ...], Path] = {}
+
+    def folder(belief: str = "drbpn", *overrides: str) -> Path:
+        key = (belief, *overrides)
+        if key not in made:
+            path = tmp_path_factory.mktemp("runs") / belief
+            made[key] = make_folder(path, f"belief={belief}", *overrides)
+        return made[key]
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def drbpn(trained_run: Callable[..., Path]) -> Path:
+    return trained_run()
+
+
+@pytest.fixture(scope="session")
+def feedforward(trained_run: Callable[..., Path]) -> Path:
+    return trained_run("none")

@@ -1,4 +1,4 @@
-"""What the tests of evaluate, diagnose and play share: short runs, and the commands as called."""
+"""What the tests of evaluate, diagnose and play share: the commands as they are called."""
 
 from __future__ import annotations
 
@@ -11,27 +11,13 @@ import pytest
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from recipe_tools import ROOT, run  # isort: skip
+from recipe_tools import ROOT  # isort: skip
 
 sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 from evaluation.conditions import Condition, parse_condition
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
-
-SMOKE = (
-    "experiment=smoke",
-    "missingness=mcar",
-    "missingness.eta=0.2",
-    "total_frames=128",
-    "evaluation.every_frames=0",
-    "evaluation.final_episodes=0",
-)
-
-
-def trained_folder(folder: Path, *overrides: str) -> Path:
-    assert run(folder, *SMOKE, *overrides) == 0
-    return folder
 
 
 def configured(command: str = "evaluate", *overrides: str) -> dict[str, Any]:

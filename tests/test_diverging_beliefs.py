@@ -1,12 +1,11 @@
 """Beliefs that leave the range of their numbers, under test: what they stop, and what not.
 
 Such a belief stops its own robot and no other; the belief of an episode that is over goes no
-further; every command answers the filter's error with a line; a report tells how many there were.
+further; every command answers the filter's error with a line.
 """
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,12 @@ import torch
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from evaluation_tools import SMOKE, evaluate, parse, trained_folder  # isort: skip
+from evaluation_tools import evaluate, parse, read_rows  # isort: skip
 
 import diagnose as diagnose_recipe
 from analysis.calibration import diagnose
 from evaluation.table import Protocol, evaluate_condition
 from evaluation.trained import TrainedAgent, load_trained_agent
-from omegaconf import DictConfig
-from recipe_tools import make_config
 from training.config import explained
 from training.errors import UserError
 
@@ -31,13 +28,8 @@ from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
 
 
 @pytest.fixture(scope="module")
-def drbpn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained_folder(tmp_path_factory.mktemp("runs") / "drbpn")
-
-
-@pytest.fixture(scope="module")
-def settings() -> DictConfig:
-    return make_config(*SMOKE)
+def trained(drbpn: Path) -> TrainedAgent:
+    return load_trained_agent(drbpn)
 
 
 def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
@@ -50,10 +42,9 @@ def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
 def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
-    drbpn: Path, settings: DictConfig, monkeypatch: pytest.MonkeyPatch, value: float
+    trained: TrainedAgent, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
-    point = parse("mcar:0.5", settings)
-    trained, protocol = load_trained_agent(drbpn), Protocol(3, 1, 0, 1, None)
+    point, protocol = parse("mcar:0.5", trained.settings), Protocol(3, 1, 0, 1, None)
     expected = evaluate_condition(trained, point, ["sampled"], protocol)
     step, calls, actions = BeliefFilter.step, [], []
 
@@ -82,12 +73,12 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     assert len(stopped) > 0
     assert (stopped == 0).all()
     assert (np.stack(actions)[:2, 1] != 0).all()
-    assert trained.agent.belief.filter.validate  # who asks by himself is told
+    assert trained.agent.belief.filter.validate  # elsewhere it raises
 
 
 @pytest.mark.parametrize("command", ["evaluate", "diagnose"])
 def test_the_belief_of_an_episode_that_is_over_goes_no_further(
-    drbpn: Path, settings: DictConfig, monkeypatch: pytest.MonkeyPatch, command: str
+    trained: TrainedAgent, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     """Fed its last observation for ever it may diverge, and stop an evaluation of others."""
     step, means, resets = BeliefFilter.step, [], []
@@ -98,15 +89,12 @@ def test_the_belief_of_an_episode_that_is_over_goes_no_further(
         return step(self, *args, **options)
 
     monkeypatch.setattr(BeliefFilter, "step", look)
-    point = parse("mcar:0.5", settings)
+    point = parse("mcar:0.5", trained.settings)
     if command == "evaluate":
-        protocol = Protocol(4, 1, 0, 1, None)
-        rows = evaluate_condition(load_trained_agent(drbpn), point, ["sampled"], protocol)
+        rows = evaluate_condition(trained, point, ["sampled"], Protocol(4, 1, 0, 1, None))
         lengths = [row["length"] for row in rows]
     else:
-        tally = diagnose(
-            load_trained_agent(drbpn), point, episodes=4, mode="sampled", seed=1, bins=[1, 2]
-        )  # fmt: skip
+        tally = diagnose(trained, point, episodes=4, mode="sampled", seed=1, bins=[1, 2])
         lengths = tally.lengths.int().tolist()
     assert len(set(lengths)) > 1
     assert len(means) == max(lengths)
@@ -152,8 +140,7 @@ def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
     monkeypatch.setattr(diagnose_recipe, "diagnose", diverging)
     assert run_diagnosis(drbpn, tmp_path, points=["mcar:0.8", "mcar:0.4"]) == 0
     assert "drbpn, mcar:0.8: no rows, the belief is no longer finite" in capsys.readouterr().out
-    with (tmp_path / "precision.csv").open(newline="") as file:
-        assert {row["point"] for row in csv.DictReader(file)} == {"mcar:0.4"}
+    assert {row["point"] for row in read_rows(tmp_path / "precision.csv")} == {"mcar:0.4"}
     with pytest.raises(UserError, match="no point is left: every belief diverged"):
         run_diagnosis(drbpn, tmp_path, points=["mcar:0.8"])
 

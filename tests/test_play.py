@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,6 @@ from evaluation_tools import configured, evaluate, parse  # isort: skip
 import play
 from evaluation.trained import load_trained_agent
 from matplotlib.image import imread
-from recipe_tools import make_folder
 from rendering import trajectory
 from rendering.belief_figure import ABSENT, BELIEF, MISSING, chosen_sensors
 from rendering.trajectory import Camera, Recording, record_episode
@@ -39,13 +39,8 @@ SMALL = {"start": 0, "steps": 6, "sensors": 2, "window": 4, "size": 240, "robot"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_folder(tmp_path_factory.mktemp("runs") / "smoke")
-
-
-@pytest.fixture(scope="module")
-def recording(folder: Path) -> Recording:
-    return record(folder)
+def recording(drbpn: Path) -> Recording:
+    return record(drbpn)
 
 
 def show(folder: Path, out: Path | None, **changes: Any) -> int:
@@ -80,27 +75,27 @@ def pixels_of(film: Film, panel: int, row: float, window: int = 4) -> tuple[Any,
 # The recording --------------------------------------------------------------------------------
 
 
-def test_a_recording_is_the_first_episode_of_an_evaluation(folder: Path, tmp_path: Path) -> None:
-    whole = record(folder, steps=100_000)
-    rows = evaluate(tmp_path / "t.csv", folder, points="'mcar:0.5'", seed=4, modes=["sampled"])
+def test_a_recording_is_the_first_episode_of_an_evaluation(drbpn: Path, tmp_path: Path) -> None:
+    whole = record(drbpn, steps=100_000)
+    rows = evaluate(tmp_path / "t.csv", drbpn, points="'mcar:0.5'", seed=4, modes=["sampled"])
     assert len(whole.steps) == int(rows[0]["length"])
     assert whole.missing_ratio == pytest.approx(float(rows[0]["missing_ratio"]))
-    later = record(folder, start=2, steps=3)
+    later = record(drbpn, start=2, steps=3)
     np.testing.assert_array_equal(later.steps, [2, 3, 4])
     np.testing.assert_array_equal(later.estimate, whole.estimate[2:5])
 
 
 def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(
-    folder: Path, recording: Recording
+    drbpn: Path, recording: Recording
 ) -> None:
     assert 0 < recording.missing_ratio < 1
     assert (recording.arrived[~recording.observed] == 0).all()
-    clean = record(folder, "noise:0")
+    clean = record(drbpn, "noise:0")
     np.testing.assert_allclose(
         clean.arrived[clean.observed], clean.complete[clean.observed], atol=1e-5
     )
-    assert (record(folder, "none:0").observed).all()
-    assert np.isnan(record(folder, "none:0").coverage)
+    assert (record(drbpn, "none:0").observed).all()
+    assert np.isnan(record(drbpn, "none:0").coverage)
 
 
 def test_coverage_counts_the_missing_entries_inside_their_interval(recording: Recording) -> None:
@@ -123,11 +118,11 @@ def test_the_sensors_that_miss_most_are_chosen_in_the_order_of_the_observation(
 
 
 def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, again = tmp_path / "film.gif", tmp_path / "again.gif"
     for path in (out, again):
-        assert show(folder, path, point="mcar:0.5", steps=5, every=2, fps=25, size=321) == 0
+        assert show(drbpn, path, point="mcar:0.5", steps=5, every=2, fps=25, size=321) == 0
     with Image.open(out) as video:
         assert (video.format, video.n_frames, video.size) == ("GIF", 3, (320, 200))
         assert (video.info["duration"], video.info["loop"]) == (40, 0)
@@ -138,12 +133,10 @@ def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(
     assert "3 frames of 320 x 200; written" in said
 
 
-def test_without_a_name_the_film_lies_in_the_run_folder(folder: Path) -> None:
-    before = set(folder.iterdir())
+def test_without_a_name_the_film_lies_in_the_run_folder(drbpn: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(drbpn, tmp_path / "run")
     assert show(folder, None, steps=2) == 0
-    (out,) = set(folder.iterdir()) - before
-    assert out.name == "play.gif"
-    out.unlink()
+    assert (folder / "play.gif").is_file()
 
 
 def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path: Path) -> None:
@@ -162,11 +155,11 @@ def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 def test_an_mp4_has_the_frames_and_the_size_that_were_asked_for(
-    folder: Path, tmp_path: Path
+    drbpn: Path, tmp_path: Path
 ) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     out = tmp_path / "film.mp4"
-    assert show(folder, out, size=242, fps=30, steps=4) == 0
+    assert show(drbpn, out, size=242, fps=30, steps=4) == 0
     # Two even sides, neither a multiple of 16.
     about, *frames = ffmpeg.read_frames(str(out))
     assert (about["size"], about["fps"], len(frames)) == ((242, 152), 30, 4)
@@ -174,10 +167,10 @@ def test_an_mp4_has_the_frames_and_the_size_that_were_asked_for(
 
 
 def test_a_png_is_the_figure_of_the_belief_the_same_bytes_each_time(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("a.png", "b.png"):
-        assert show(folder, tmp_path / name, point="mcar:0.5", start=1) == 0
+        assert show(drbpn, tmp_path / name, point="mcar:0.5", start=1) == 0
     assert "the 95 % intervals hold" in capsys.readouterr().out
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     pixels = imread(tmp_path / "a.png")[..., :3]
@@ -219,12 +212,12 @@ def test_the_robot_of_each_step_is_in_its_frame(recording: Recording) -> None:
 
 
 def test_the_robot_is_drawn_where_this_machine_can_and_else_one_line_says_why(
-    folder: Path,
+    drbpn: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    pictures = record(folder, steps=2, picture_size=(60, 80)).pictures
+    pictures = record(drbpn, steps=2, picture_size=(60, 80)).pictures
     failed = "off-screen rendering failed" in capsys.readouterr().out
     assert failed == (not pictures)
     for picture in pictures:
@@ -236,7 +229,7 @@ def test_the_robot_is_drawn_where_this_machine_can_and_else_one_line_says_why(
         raise RuntimeError("no display")
 
     monkeypatch.setattr(trajectory.Camera, "picture", broken)
-    assert record(folder, steps=2, picture_size=(60, 80)).pictures == []
+    assert record(drbpn, steps=2, picture_size=(60, 80)).pictures == []
     said = capsys.readouterr().out
     assert said == "no pictures of the robot, off-screen rendering failed: no display\n"
 
@@ -262,12 +255,12 @@ def test_a_task_that_is_not_mujocos_is_drawn_where_its_state_can_be_set() -> Non
 # Points and beliefs ---------------------------------------------------------------------------
 
 
-def test_a_point_may_take_sensors_away_for_good(folder: Path, tmp_path: Path) -> None:
-    assert show(folder, tmp_path / "film.gif", point="reduction:0.5:random", steps=3) == 0
+def test_a_point_may_take_sensors_away_for_good(drbpn: Path, tmp_path: Path) -> None:
+    assert show(drbpn, tmp_path / "film.gif", point="reduction:0.5:random", steps=3) == 0
     with Image.open(tmp_path / "film.gif") as video:
         video.seek(2)
         frame = np.asarray(video.convert("RGB"))
-    film = make_film(record(folder, steps=3), width=240)
+    film = make_film(record(drbpn, steps=3), width=240)
     absent = []
     for each in range(4):
         row, columns = pixels_of(film, 0, (each + 0.5) / 4)
@@ -276,18 +269,18 @@ def test_a_point_may_take_sensors_away_for_good(folder: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("belief", "told", "has_interval"),
+    ("belief", "kind", "has_interval"),
     [("none", "nothing", False), ("fill", "estimate", False), ("gru", "forecast", True)],
 )
 def test_another_belief_shows_what_it_says_and_no_more(
-    tmp_path: Path, belief: str, told: str, has_interval: bool
+    trained_run: Any, tmp_path: Path, belief: str, kind: str, has_interval: bool
 ) -> None:
-    other = make_folder(tmp_path / belief, f"belief={belief}")
+    other = trained_run(belief)
     recording = record(other)
-    assert recording.told == told
+    assert recording.kind == kind
     assert np.isfinite(recording.std).all() == has_interval
-    assert np.isfinite(recording.estimate).all() == (told != "nothing")
-    assert near(make_film(recording)[-1], BELIEF, 60).any() == (told != "nothing")
+    assert np.isfinite(recording.estimate).all() == (kind != "nothing")
+    assert near(make_film(recording)[-1], BELIEF, 60).any() == (kind != "nothing")
     assert show(other, tmp_path / "belief.png", steps=2) == 0
 
 
@@ -298,16 +291,11 @@ def test_another_belief_shows_what_it_says_and_no_more(
     ("changes", "message"),
     [
         ({"run": None}, "`run` must name a run folder"),
-        ({"run": "nowhere"}, "`run` must name a run folder: .*got nowhere"),
         ({"point": "mcar:2"}, "`points` must hold"),
         ({"mode": "best"}, "`modes` must hold"),
-        ({"steps": 0}, "`steps` must be 1 or more, got 0"),
-        ({"every": 0}, "`every` must be 1 or more, got 0"),
-        ({"window": 1}, "`window` must be 2 or more, got 1"),
-        ({"start": -1}, "`start` must be 0 or more, got -1"),
+        ({"steps": 0}, r"`steps` must be in \[1, inf\], got 0"),
+        ({"start": -1}, r"`start` must be in \[0, inf\], got -1"),
         ({"start": 100_000}, "`start` must lie inside the episode"),
-        ({"size": 100}, r"`size` must be in \[240, 1920\], got 100"),
-        ({"colours": 300}, r"`colours` must be in \[8, 256\], got 300"),
         ({"fps": 60}, r"`fps` must be in \[1, 50\], got 60"),
         ({"sensors": ["pole"]}, "`sensors` must be among 0 cart position, .*got 'pole'"),
         ({"sensors": [4]}, "`sensors` must be among .*got 4"),
@@ -317,24 +305,24 @@ def test_another_belief_shows_what_it_says_and_no_more(
     ],
 )
 def test_bad_input_is_answered_with_one_line(
-    folder: Path, tmp_path: Path, changes: dict[str, Any], message: str
+    drbpn: Path, tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(UserError, match=message) as caught:
-        show(folder, **({"out": tmp_path / "film.gif"} | changes))
+        show(drbpn, **({"out": tmp_path / "film.gif"} | changes))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(folder: Path) -> None:
-    length = len(record(folder, steps=100_000).steps)
+def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(drbpn: Path) -> None:
+    length = len(record(drbpn, steps=100_000).steps)
     with pytest.raises(UserError, match=f"`start` must lie .* after {length} steps"):
-        show(folder, folder / "film.gif", point="mcar:0.5", start=length + 2, window=10)
+        show(drbpn, drbpn / "film.gif", point="mcar:0.5", start=length + 2, window=10)
 
 
 def test_an_mp4_without_its_package_is_refused_before_anything_is_done(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None)
     with pytest.raises(UserError, match=r"needs imageio-ffmpeg: .* film.gif"):
-        show(folder, tmp_path / "film.mp4")
+        show(drbpn, tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())

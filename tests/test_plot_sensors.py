@@ -9,30 +9,28 @@ The recipe writes two pictures and a table, whole, and answers bad input with on
 
 from __future__ import annotations
 
-import csv
 import shutil
-import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDict
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from recipe_tools import make_folder  # isort: skip
+import recipe_tools  # noqa: F401 - finds recipes/  # isort: skip
 
 import plot_sensors
-from analysis.sensor_figures import place_of_sensors, random_orders
+from analysis.sensor_figures import mean_places, random_orders
 from evaluation.sensor_choice import SensorModel, kept_sensors, learned_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.image import imread
+from omegaconf import OmegaConf
 from training.errors import UserError
-from training.run_folder import read_config, write_config
 
 from torchrl_drbpn import (
     BeliefFilterModule,
@@ -42,28 +40,26 @@ from torchrl_drbpn import (
     select_sensors,
 )
 
-RUNS = Path(tempfile.mkdtemp(prefix="sensors-"))
-NO_MODEL = RUNS / "others" / "hopper-v4-none-s0"
 OBS, ACTION = 11, 3
+HOPPER = ("env=hopper", "env.version=v4")
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _runs() -> Iterator[None]:
-    NO_MODEL.parent.mkdir()
-    task = ("env=hopper", "env.version=v4")
-    for seed in range(3):
-        make_folder(RUNS / f"hopper-v4-s{seed}", *task, f"seed={seed}")
-    for belief in ("none", "gru"):
-        make_folder(NO_MODEL.with_name(f"hopper-v4-{belief}-s0"), *task, f"belief={belief}")
-    yield
-    shutil.rmtree(RUNS)
+@pytest.fixture(scope="module")
+def runs(trained_run: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Three training seeds on Hopper, with names of their folders, and one without a model."""
+    root = tmp_path_factory.mktemp("sensors")
+    kinds = [("drbpn", *HOPPER, f"seed={seed}") for seed in range(3)] + [("none", *HOPPER)]
+    return [
+        Path(shutil.copytree(trained_run(*kind), root / f"{i}-{kind[0]}"))
+        for i, kind in enumerate(kinds)
+    ]
 
 
 @pytest.fixture(scope="module")
-def agents() -> list[TrainedAgent]:
-    return [load_trained_agent(RUNS / f"hopper-v4-s{seed}") for seed in range(3)]
+def agents(runs: list[Path]) -> list[TrainedAgent]:
+    return [load_trained_agent(folder) for folder in runs[:3]]
 
 
 @pytest.fixture(scope="module")
@@ -121,35 +117,22 @@ def test_spikes_count_as_noise_that_was_added(agents: list[TrainedAgent]) -> Non
 # The choice -------------------------------------------------------------------------------------
 
 
-def test_the_kept_sensors_are_those_of_the_learned_model(
+def test_the_kept_sensors_are_the_first_of_the_ranking(
     agents: list[TrainedAgent], models: list[SensorModel]
 ) -> None:
-    everything = kept_sensors(agents[0], OBS)
-    assert sorted(everything) == list(range(OBS))
-    for count in (0, 1, 4):
-        assert kept_sensors(agents[0], count) == everything[:count]
-    space = agents[0].agent.belief.filter.state_space()
-    direct = select_sensors(space.emission_matrix, space.transition_cov, space.emission_cov, 4)
-    assert kept_sensors(agents[0], 4) == direct.indices.tolist()
+    ranking = models[0].ranking("D").tolist()
+    assert sorted(ranking) == list(range(OBS))
+    for count in (0, 1, OBS):
+        assert kept_sensors(agents[0], count) == ranking[:count]
 
 
-def test_the_kept_sensors_tell_more_than_nearly_all_random_ones(
-    agents: list[TrainedAgent], models: list[SensorModel]
-) -> None:
-    for trained, model in zip(agents, models, strict=True):
-        random = model.along(random_orders(400, OBS, 0))[0]
-        for count in (2, 4, 6):
-            kept = model.along(torch.tensor(kept_sensors(trained, count)))[0][-1]
-            assert (random[:, count - 1] <= kept + 1e-9).double().mean() > 0.99
-
-
-def test_a_belief_without_a_model_is_refused() -> None:
+def test_a_belief_without_a_model_is_refused(feedforward: Path) -> None:
     with pytest.raises(UserError, match="`belief=none` has learned no H, P and R"):
-        kept_sensors(load_trained_agent(NO_MODEL), 3)
+        kept_sensors(load_trained_agent(feedforward), 3)
 
 
-def test_a_covariance_that_depends_on_the_state_ranks_no_sensors() -> None:
-    trained = load_trained_agent(RUNS / "hopper-v4-s0")
+def test_a_covariance_that_depends_on_the_state_ranks_no_sensors(runs: list[Path]) -> None:
+    trained = load_trained_agent(runs[0])
     trained.agent.belief.filter.transition = GaussianTransition(OBS, ACTION, cov_network=True)
     with pytest.raises(UserError, match="`belief=drbpn` predicts another covariance at every"):
         learned_sensors(trained)
@@ -192,24 +175,12 @@ def test_along_the_chosen_orders_is_what_select_sensors_says(models: list[Sensor
     torch.testing.assert_close(model.along(chosen.indices)[1], share)
 
 
-def test_rankings_do_not_depend_on_the_basis_of_the_state(models: list[SensorModel]) -> None:
-    T = torch.randn(OBS, OBS, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    H = models[0].emission_matrix @ torch.linalg.inv(T)
-    moved = replace(models[0], emission_matrix=H, predicted_cov=T @ models[0].predicted_cov @ T.mT)
-    for criterion in ("D", "A"):
-        assert torch.equal(moved.ranking(criterion), models[0].ranking(criterion))
-
-
-def test_places_count_from_one_and_random_orders_follow_their_seed(
-    models: list[SensorModel],
-) -> None:
-    places = place_of_sensors(models, "D")
-    assert places.shape == (3, OBS)
-    for line, model in zip(places, models, strict=True):
-        assert line[model.ranking("D")[0]] == 1
-        assert sorted(line) == list(range(1, OBS + 1))
-    assert torch.equal(random_orders(5, 4, 1), random_orders(5, 4, 1))
-    assert not torch.equal(random_orders(5, 4, 1), random_orders(5, 4, 2))
+def test_mean_places_count_from_one(models: list[SensorModel]) -> None:
+    places = mean_places(models[:1], "D")
+    assert sorted(places) == list(range(1, OBS + 1))
+    assert places[models[0].ranking("D")[0]] == 1
+    both = (places + mean_places(models[1:2], "D")) / 2
+    np.testing.assert_array_equal(mean_places(models[:2], "D"), both)
 
 
 # The recipe -------------------------------------------------------------------------------------
@@ -222,58 +193,54 @@ def draw(run: Any, out: Path | None, **changes: Any) -> int:
     return plot_sensors.run(base | {"dpi": 50} | changes)
 
 
-@pytest.fixture
-def copied(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(RUNS / "hopper-v4-s0", tmp_path / "hopper-v4-s0"))
-
-
-def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(tmp_path: Path) -> None:
+def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(
+    runs: list[Path], tmp_path: Path
+) -> None:
     out = tmp_path / "new" / "sensors"
-    assert draw([str(RUNS / "hopper-v4-s1"), str(RUNS / "hopper-v4-s0")], out) == 0
+    assert draw([str(runs[1]), str(runs[0])], out) == 0
     assert sorted(path.name for path in out.iterdir()) == FILES
     for name in (FILES[0], FILES[2]):
         pixels = imread(out / name)[..., :3]
         assert 0.01 < (pixels.min(-1) < 0.9).mean() < 0.9
-    with (out / "sensor_ranking.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2 * OBS
-    assert [row["training_seed"] for row in rows[:: 2 * OBS]] == ["0", "1"]
-    for start in range(0, len(rows), OBS):
-        part = rows[start : start + OBS]
-        assert [int(row["place"]) for row in part] == list(range(1, OBS + 1))
-        assert len({row["sensor"] for row in part}) == OBS
-        assert (np.diff([float(row["information"]) for row in part]) >= 0).all()
-        assert (np.diff([float(row["variance_left"]) for row in part]) <= 0).all()
+    rows = pd.read_csv(out / "sensor_ranking.csv")
+    groups = rows.groupby(["training_seed", "criterion"])
+    assert sorted(groups.groups) == [(0, "A"), (0, "D"), (1, "A"), (1, "D")]
+    for _, part in groups:
+        assert part.place.tolist() == list(range(1, OBS + 1))
+        assert part.sensor.nunique() == OBS
+        assert part.information.is_monotonic_increasing
+        assert part.variance_left.is_monotonic_decreasing
 
 
 def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     young = tmp_path / "young"
     young.mkdir()
-    shutil.copy(RUNS / "hopper-v4-s0" / "config.yaml", young)
-    runs = [str(NO_MODEL), str(RUNS / "hopper-v4-s0"), str(young)]
-    assert draw(runs, tmp_path / "out") == 0
+    shutil.copy(runs[0] / "config.yaml", young)
+    assert draw([str(runs[3]), str(runs[0]), str(young)], tmp_path / "out") == 0
     said = capsys.readouterr().out
-    assert "hopper-v4-none-s0: left out; `belief=none` has learned no H, P and R" in said
+    assert "3-none: left out; `belief=none` has learned no H, P and R" in said
     assert "young: left out, it has no checkpoint yet" in said
     assert "1 run, written" in said
-    with (tmp_path / "out" / "sensor_ranking.csv").open(newline="") as file:
-        assert {row["method"] for row in csv.DictReader(file)} == {"drbpn"}
+    twin = shutil.copytree(runs[3], tmp_path / "twin")
     with pytest.raises(UserError, match="`run` must name runs that have learned H, P and R"):
-        draw([str(NO_MODEL), str(NO_MODEL.with_name("hopper-v4-gru-s0"))], tmp_path / "none")
+        draw([str(runs[3]), str(twin)], tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
-def test_methods_are_drawn_apart(copied: Path, agents: list[TrainedAgent]) -> None:
-    write_config(copied, read_config(copied) | {"method": "ppo_ours"})
-    other = load_trained_agent(copied)
-    assert plot_sensors._title(other).startswith("Hopper-v4, ppo_ours\n")
-    assert plot_sensors._title(agents[0]).startswith("Hopper-v4, drbpn\n")
-    assert plot_sensors._title(agents[0]) == plot_sensors._title(agents[1])
+def test_methods_are_drawn_apart(agents: list[TrainedAgent]) -> None:
+    settings = OmegaConf.merge(agents[0].settings, {"method": "ppo_ours"})
+    named = replace(agents[0], settings=settings)
+    assert plot_sensors.title(named).startswith("Hopper-v4, ppo_ours\n")
+    assert plot_sensors.title(agents[0]).startswith("Hopper-v4, drbpn\n")
+    assert plot_sensors.title(agents[0]) == plot_sensors.title(agents[1])
 
 
-def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(copied: Path) -> None:
+def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(
+    runs: list[Path], tmp_path: Path
+) -> None:
+    copied = shutil.copytree(runs[0], tmp_path / "run")
     written = []
     for _ in range(2):
         assert draw(str(copied), None, correlation=False) == 0
@@ -290,18 +257,22 @@ def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(copied: Path)
         ({"run": None}, "`run` must name run folders"),
         ({"run": "nowhere/*"}, "`run` must name run folders, nowhere/\\* matches none"),
         ({"run": "nowhere"}, "there is no folder nowhere"),
-        ({"run": str(RUNS / "hopper*"), "out": None}, "`out` must name a folder for .* 3 runs"),
         ({"orders": 5}, "`orders` must be 20 or more"),
         ({"dpi": 0}, "`dpi` 1 or more"),
         ({"out": __file__}, "`out` must be a folder, .* is a file"),
-        ({"run": str(NO_MODEL)}, "`belief=none` has learned no H, P and R"),
     ],
 )
 def test_bad_input_is_answered_with_one_line(
-    tmp_path: Path, changes: dict[str, Any], message: str
+    runs: list[Path], tmp_path: Path, changes: dict[str, Any], message: str
 ) -> None:
-    options = {"run": str(RUNS / "hopper-v4-s0"), "out": tmp_path / "out"} | changes
     with pytest.raises(UserError, match=message) as caught:
-        draw(**options)
+        draw(**({"run": str(runs[0]), "out": tmp_path / "out"} | changes))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_several_runs_need_a_folder_and_one_without_a_model_is_refused(runs: list[Path]) -> None:
+    with pytest.raises(UserError, match="`out` must name a folder for 2 runs"):
+        draw([str(folder) for folder in runs[:2]], None)
+    with pytest.raises(UserError, match="`belief=none` has learned no H, P and R"):
+        draw(str(runs[3]), None)

@@ -7,6 +7,7 @@ user gets wrong is one line.
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -18,16 +19,17 @@ import pytest
 
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
-from recipe_tools import BELIEFS, ROOT, make_config  # isort: skip
+from recipe_tools import ROOT, make_config  # isort: skip
 
 from analysis.figures import draw_evaluation, episode_summary
 from analysis.runs import over_episodes, read_runs, write_table
 from analysis.statistics import interquartile_mean, interval, probability_of_improvement, ratio
 from analysis.tables import derived_tables, point_kind, point_order
+from omegaconf import OmegaConf
 from report import run
 from training.config import missingness_name
 from training.errors import UserError
-from training.methods import method_name, training_labels
+from training.methods import method_name
 from training.run_folder import read_config, write_config
 
 ASKED = {"run": None, "out": None, "from": None, "title": None}
@@ -50,6 +52,11 @@ def episodes(returns: dict[str, tuple[float, ...]], mode: str = "sampled") -> li
     ]
 
 
+@functools.cache
+def composed(*overrides: str) -> Any:
+    return make_config("env=hopper", "env.version=v4", "total_frames=400", *overrides)
+
+
 def make_run(
     folder: Path,
     *overrides: str,
@@ -60,8 +67,7 @@ def make_run(
 ) -> Path:
     """Write what a run leaves behind."""
     folder.mkdir(parents=True)
-    usual = ("env=hopper", "env.version=v4", "total_frames=400", f"seed={seed}")
-    write_config(folder, make_config(*usual, *overrides))
+    write_config(folder, OmegaConf.merge(composed(*overrides), {"seed": seed}))
     (folder / "versions.json").write_text(json.dumps({"torch": "2.13.0", "git_commit": "abc"}))
     last = {"episodes": 200, "return": final, "missing_ratio": 0.3, "log_likelihood": 1.5}
     first = {"episodes": 0, "return": None, "missing_ratio": 0.1, "log_likelihood": 1.5}
@@ -152,19 +158,11 @@ def test_the_probability_of_improvement_counts_pairs() -> None:
 # Names ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("belief", BELIEFS)
-def test_a_run_is_called_by_its_belief_unless_it_is_named(belief: str) -> None:
-    config = make_config(f"belief={belief}")
-    assert method_name(config) == belief
+def test_a_run_is_called_by_its_belief_unless_it_is_named() -> None:
+    config = composed("belief=gru")
+    assert method_name(config) == "gru"
     assert method_name({**config} | {"method": "mine"}) == "mine"
-    assert method_name(make_config(f"belief={belief}", "algo=acktr")) == f"{belief} (acktr)"
-
-
-def test_labels_tell_what_differs_and_nothing_else() -> None:
-    mar, clean = ("gru", "mar:0.5", 1.0), ("gru", "none:0", 1.0)
-    other, loud = ("drbpn", "mar:0.5", 1.0), ("gru", "mar:0.5", 3.0)
-    assert training_labels([mar, other]) == {mar: "gru", other: "drbpn"}
-    assert training_labels([mar, loud, clean])[loud] == "gru, mar:0.5, sigma 3"
+    assert method_name(composed("belief=gru", "algo=acktr")) == "gru (acktr)"
 
 
 def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it() -> None:

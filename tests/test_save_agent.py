@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("hydra")
 pytest.importorskip("safetensors")
-from evaluation_tools import evaluate, trained_folder  # isort: skip
+from evaluation_tools import evaluate  # isort: skip
 
 import play
 import save_agent
@@ -20,9 +20,8 @@ from training.errors import UserError
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    return trained_folder(folder, "evaluation.final_episodes=2")
+def finished(trained_run: Any) -> Path:
+    return trained_run("drbpn", "evaluation.final_episodes=2")
 
 
 def save(run: Any, out: Any) -> int:
@@ -46,17 +45,18 @@ def test_a_saved_agent_acts_as_the_run_did(finished: Path, tmp_path: Path) -> No
     film = configured("play") | {"run": str(out), "robot": False, "start": 0, "steps": 2}
     assert play.run(film) == 0
     card = (out / "README.md").read_text()
-    for told in ("# InvertedPendulum-v5, drbpn", "mcar:0.2", "| 128 |", "| seed | 0 |", "sampled"):
-        assert told in card
+    for text in ("# InvertedPendulum-v5, drbpn", "mcar:0.4", "| 128 |", "| seed | 0 |", "sampled"):
+        assert text in card
 
 
-def test_what_is_no_finished_run_or_no_weights_is_one_line(finished: Path, tmp_path: Path) -> None:
-    young = trained_folder(tmp_path / "young")
+def test_what_is_no_finished_run_or_no_weights_is_one_line(
+    finished: Path, drbpn: Path, tmp_path: Path
+) -> None:
     for run, out, message in (
         (None, tmp_path / "x", "`run` must name a folder"),
         (finished, None, "`out` must name a folder"),
-        (finished, young, "`out` must be a folder for an agent"),
-        (young, tmp_path / "x", "has no final evaluation yet"),
+        (finished, drbpn, "`out` must be a folder for an agent"),
+        (drbpn, tmp_path / "x", "has no final evaluation yet"),
     ):
         with pytest.raises(UserError, match=message):
             save(run, out)

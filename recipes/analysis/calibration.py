@@ -1,7 +1,7 @@
 """How precise and how well calibrated a trained agent's belief is, episode by episode.
 
-Two clocks run for every sensor. An entry that arrives is held against the forecast made before it
-arrived; an entry that does not is held against what complete, noiseless sensors would have shown.
+Two clocks run for every sensor. An entry that arrives is compared with the forecast made before it
+arrived; an entry that does not is compared with what complete, noiseless sensors would have shown.
 Both are sorted by the steps since that sensor was last seen before this step: 1 where it was seen
 the step before, 2 after one step without, and so on; "never" where it was not seen yet in this
 episode. All numbers are in normalised units, one being a running standard deviation of the sensor.
@@ -43,43 +43,42 @@ _WRITTEN = {
 Sums = dict[str, Tensor]
 
 
-class Forecast(NamedTuple):
-    """A Gaussian that is held against what was the case.
+class Compared(NamedTuple):
+    """What is compared with what.
 
     Attributes:
-        estimate: ``filtered`` (after this step's observation) or ``predicted`` (before it).
-        noise: whether its variance holds that of the sensor noise.
+        estimate: ``filtered`` (after this step's observation), ``predicted`` (before it), ...
+        noise: whether its variance holds that of the sensor noise; None: it is a point.
         target: ``reading``, the noisy one that arrived, or ``truth``, the noiseless one.
         entries: those that ``arrived`` at this step, or those ``missing``.
     """
 
     estimate: str
-    noise: bool
+    noise: bool | None
     target: str
     entries: str
 
 
 @dataclass
 class Tally:
-    """Sums over the steps of each episode, of shape ``(episodes, classes)`` unless said otherwise.
+    """Sums over the steps of each episode.
 
     Attributes:
         classes: names of the classes of steps since last seen; the last is ``never``.
         lengths: steps of each episode, shape ``(episodes,)``.
         observed: entries that arrived, shape ``(episodes,)``.
         components: sensors.
-        errors: by estimate and kind of entries, ``count`` and ``squared`` error.
-        forecasts: of each forecast, sums such as ``crps``; ``nis`` of each class by itself,
-            ``nis_joint`` of all entries of a step together, ``(episodes, 1)``; ``under``, how many
-            values came under each of `LEVELS`, ``(episodes, levels)``.
+        sums: of each pair, of shape ``(episodes, classes)`` unless said otherwise: ``count``,
+            ``squared`` error, of Gaussians also scores such as ``crps``, ``nis`` of each class by
+            itself, ``nis_joint`` of all entries of a step together, ``(episodes, 1)``, and
+            ``under``, how many values lay under each of `LEVELS`, ``(episodes, levels)``.
     """
 
     classes: list[str]
     lengths: Tensor
     observed: Tensor
     components: int
-    errors: dict[tuple[str, str], Sums] = field(default_factory=dict)
-    forecasts: dict[Forecast, Sums] = field(default_factory=dict)
+    sums: dict[Compared, Sums] = field(default_factory=dict)
 
     @property
     def missing_ratio(self) -> float:
@@ -99,16 +98,16 @@ class Tally:
         for estimate in [e for e in (FILTERED, PREDICTED, LAST_VALUE, MEAN) if e in steps]:
             squared = (steps[estimate] - steps[TRUTH]).square()
             for entries, mask in masks.items():
-                sums = self.errors.setdefault((estimate, entries), {})
-                self._add(sums, rows, self._by_class(steps, mask, {"squared": squared}))
-        for forecast, variance in _variances(steps).items():
-            mask, sums = masks[forecast.entries], self.forecasts.setdefault(forecast, {})
-            self._add(sums, rows, self._scores(steps, forecast, variance, mask))
+                part = self._by_class(steps, mask, {"squared": squared})
+                self._add(Compared(estimate, None, TRUTH, entries), rows, part)
+        for pair, variance in _variances(steps).items():
+            self._add(pair, rows, self._scores(steps, pair, variance, masks[pair.entries]))
 
     def _scores(
-        self, steps: Mapping[str, Tensor], forecast: Forecast, variance: Tensor, mask: Tensor
+        self, steps: Mapping[str, Tensor], pair: Compared, variance: Tensor, mask: Tensor
     ) -> Sums:
-        value, mean, std = steps[forecast.target], steps[forecast.estimate], _root(variance)
+        value, mean = steps[pair.target], steps[pair.estimate]
+        std = variance.clamp_min(_SMALLEST_VARIANCE).sqrt()
         error, pit = value - mean, gaussian_pit(value, mean, std)
         numbers = {
             "squared": error.square(),
@@ -121,7 +120,7 @@ class Tally:
         out = self._by_class(steps, mask, numbers)
         under = pit.unsqueeze(-1) <= torch.tensor(LEVELS, dtype=pit.dtype)
         out["under"] = (under & mask.unsqueeze(-1)).sum((1, 2)).double()
-        if forecast.target == READING:
+        if pair.target == READING:
             cov = steps["predicted cov"]
             out["nis_joint"] = nis(error, cov, mask).sum(-1, keepdim=True)
             out["nis"] = torch.zeros_like(out["count"])
@@ -143,10 +142,26 @@ class Tally:
             for name, value in weights.items()
         }
 
-    def _add(self, sums: Sums, rows: slice, part: Sums) -> None:
+    def _add(self, pair: Compared, rows: slice, part: Sums) -> None:
+        sums = self.sums.setdefault(pair, {})
         for name, value in part.items():
             empty = value.new_zeros(len(self.lengths), value.shape[1])
             sums.setdefault(name, empty)[rows] += value
+
+
+def _variances(steps: Mapping[str, Tensor]) -> dict[Compared, Tensor]:
+    """Return the variances of every Gaussian that the steps hold."""
+    out: dict[Compared, Tensor] = {}
+    if "predicted cov" in steps:
+        variance = steps["predicted cov"].diagonal(dim1=-2, dim2=-1)
+        kinds = ((READING, ARRIVED), (TRUTH, ARRIVED), (TRUTH, MISSING))
+        out |= {Compared(PREDICTED, True, *kind): variance for kind in kinds}
+    if "filtered variance" in steps:
+        variance = steps["filtered variance"]
+        out |= {Compared(FILTERED, False, TRUTH, kind): variance for kind in (ARRIVED, MISSING)}
+        if "noise variance" in steps:
+            out[Compared(FILTERED, True, TRUTH, MISSING)] = variance + steps["noise variance"]
+    return out
 
 
 def diagnose(
@@ -159,20 +174,11 @@ def diagnose(
     seed: int,
     bins: Sequence[int],
 ) -> Tally:
-    """Let a trained agent act and hold its belief against what was the case.
+    """Let a trained agent act and compare its belief with the readings and the truth.
 
-    Args:
-        trained: the agent.
-        condition: what does not arrive or is wrong.
-        removed: of :func:`evaluation.conditions.removed_sensors`.
-        episodes: how many.
-        mode: ``sampled`` actions or ``mean`` actions.
-        seed: of episodes, corruption and sampled actions. The global generator is left alone.
-        bins: where the classes of steps since last seen begin; the first is 1.
-
-    Returns:
-        The sums. An agent whose belief knows nothing of the sensors has those of the last value
-        and the running mean.
+    An agent whose belief has no estimate of the sensors has sums of the last value and the running
+    mean. ``bins`` are where the classes of steps since last seen begin; for the others see
+    :func:`evaluation.episodes.run_episodes` and :func:`evaluation.conditions.removed_sensors`.
     """
     obs = trained.obs_dim
     tally = Tally(class_names(bins), torch.zeros(episodes), torch.zeros(episodes), obs)
@@ -224,11 +230,8 @@ def diagnose(
 def class_names(bins: Sequence[int]) -> list[str]:
     """Name the classes of steps since last seen, such as ``3``, ``6-10``, ``51+``, and ``never``.
 
-    Args:
-        bins: where they begin.
-
     Raises:
-        UserError: if they do not start at 1 and ascend.
+        UserError: if ``bins``, where they begin, do not start at 1 and ascend.
     """
     pairs = list(itertools.pairwise(bins))
     if not bins or {*map(type, bins)} != {int} or bins[0] != 1 or any(a >= b for a, b in pairs):
@@ -238,40 +241,15 @@ def class_names(bins: Sequence[int]) -> list[str]:
 
 
 def pool(tallies: Sequence[Tally]) -> Tally:
-    """Put the episodes of several tallies, of one task, kind of belief and condition, together.
-
-    Args:
-        tallies: at least one.
-    """
-
-    def joined(parts: Sequence[Sums]) -> Sums:
-        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
+    """Put the episodes of several tallies, of one task, kind of belief and condition, together."""
     first = tallies[0]
     return Tally(
         first.classes,
         torch.cat([t.lengths for t in tallies]),
         torch.cat([t.observed for t in tallies]),
         first.components,
-        {key: joined([t.errors[key] for t in tallies]) for key in first.errors},
-        {key: joined([t.forecasts[key] for t in tallies]) for key in first.forecasts},
+        {
+            pair: {name: torch.cat([t.sums[pair][name] for t in tallies]) for name in sums}
+            for pair, sums in first.sums.items()
+        },
     )
-
-
-def _root(variance: Tensor) -> Tensor:
-    return variance.clamp_min(_SMALLEST_VARIANCE).sqrt()
-
-
-def _variances(steps: Mapping[str, Tensor]) -> dict[Forecast, Tensor]:
-    """Return the variances of every Gaussian that the steps hold."""
-    out: dict[Forecast, Tensor] = {}
-    if "predicted cov" in steps:
-        variance = steps["predicted cov"].diagonal(dim1=-2, dim2=-1)
-        kinds = ((READING, ARRIVED), (TRUTH, ARRIVED), (TRUTH, MISSING))
-        out |= {Forecast(PREDICTED, True, *kind): variance for kind in kinds}
-    if "filtered variance" in steps:
-        variance = steps["filtered variance"]
-        out |= {Forecast(FILTERED, False, TRUTH, kind): variance for kind in (ARRIVED, MISSING)}
-        if "noise variance" in steps:
-            out[Forecast(FILTERED, True, TRUTH, MISSING)] = variance + steps["noise variance"]
-    return out

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib as mpl
 import matplotlib.ticker
 import pandas as pd
 from matplotlib.figure import Figure
-from rendering.belief_figure import STYLE
+from rendering.style import STYLE, colours, legend_below, panel_grid
 
-from analysis.calibration import (
-    ARRIVED,
-    FILTERED,
-    LAST_VALUE,
-    LEVELS,
-    MISSING,
-    PREDICTED,
-    READING,
-    TRUTH,
-)
-
-_COLOURS = ("#1f6fb4", "#d1622b", "#3a923a", "#8d5aa8", "#7f6a4f", "#c44e7f", "#5f6b73")
 _PANEL = (4.4, 3.0)  # inches
 _FEWEST = 30  # entries of a class that is drawn
 # Column of calibration.csv, what it is of a right belief, axis, scale.
@@ -31,19 +19,17 @@ _STATISTICS: tuple[tuple[str, float | None, str, str], ...] = (
     ("coverage_95", 0.95, "share inside 95 % intervals", "linear"),
     ("crps", None, "CRPS, normalised units", "log"),
 )
-_ESTIMATES = {FILTERED: ("o-", 2.0), PREDICTED: ("s--", 1.6), LAST_VALUE: (":", 1.1)}
+_ESTIMATES = {"filtered": ("o-", 2.0), "predicted": ("s--", 1.6), "last value": (":", 1.1)}
 
+# Draw the rows of one kind of belief into the panel of a column: axis, rows, label, colour, column.
 _Draw = Callable[[Any, pd.DataFrame, str, str, int], None]
 
 
 def precision_figure(table: pd.DataFrame) -> Figure | None:
-    """Draw the error of every estimate over the steps since a sensor was last seen.
-
-    Args:
-        table: precision.csv.
+    """Draw precision.csv: the error of every estimate over the steps since last seen.
 
     Returns:
-        The figure, one column a task and one row a point; None where there is nothing to draw.
+        One column a task and one row a point; None where there is nothing to draw.
     """
     rows = table[(table["steps_since_seen"] != "all") & (table["count"] >= _FEWEST)]
 
@@ -58,24 +44,20 @@ def precision_figure(table: pd.DataFrame) -> Figure | None:
 
 
 def outage_figure(table: pd.DataFrame) -> Figure | None:
-    """Draw how well calibrated forecasts of what arrives are, by the steps since it was last seen.
-
-    Args:
-        table: calibration.csv.
+    """Draw calibration.csv: forecasts of what arrives, by the steps since it was last seen.
 
     Returns:
-        The figure, a row a task and point, and in it NIS over entries, coverage and CRPS; None
-        where no belief forecasts what arrives.
+        A row a task and point, and in it NIS over entries, coverage and CRPS; None where no belief
+        forecasts what arrives.
     """
-    wanted = (table["held_against"] == READING) & (table["steps_since_seen"] != "all")
+    wanted = (table["held_against"] == "reading") & (table["steps_since_seen"] != "all")
     rows = table[wanted & (table["count"] >= _FEWEST)]
     cells = [[own] * len(_STATISTICS) for _, own in rows.groupby(["task", "point"], sort=False)]
 
     def draw(axis: Any, own: pd.DataFrame, label: str, colour: str, column: int) -> None:
         name, right, text, scale = _STATISTICS[column]
         _curve(axis, table, own, name, "o-", lw=2.0, color=colour, label=label)
-        axis.set_yscale(scale)
-        axis.set_ylabel(text)
+        axis.set(yscale=scale, ylabel=text)
         if right is not None:
             axis.axhline(right, color="#444444", lw=0.8)
 
@@ -83,27 +65,21 @@ def outage_figure(table: pd.DataFrame) -> Figure | None:
 
 
 def reliability_figure(table: pd.DataFrame) -> Figure | None:
-    """Draw how often values came under their quantiles.
-
-    Args:
-        table: reliability.csv.
-
-    Returns:
-        The figure; None where no belief has a spread.
-    """
-    arrived = (table["held_against"] == READING) & (table["entries"] == ARRIVED)
-    missing = (table["held_against"] == TRUTH) & (table["entries"] == MISSING)
-    missing &= (table["sensor_noise"] == "out") | (table["estimate"] == PREDICTED)
-    quantiles = [f"under_{100 * level:g}" for level in LEVELS]
+    """Draw reliability.csv: how often values lay under their quantiles; None without a spread."""
+    arrived = (table["held_against"] == "reading") & (table["entries"] == "arrived")
+    missing = (table["held_against"] == "truth") & (table["entries"] == "missing")
+    missing &= (table["sensor_noise"] == "out") | (table["estimate"] == "predicted")
+    quantiles = [name for name in table if name.startswith("under_")]
+    levels = [float(name.removeprefix("under_")) / 100 for name in quantiles]
 
     def draw(axis: Any, own: pd.DataFrame, label: str, colour: str, _: int) -> None:
-        kinds = ((own["held_against"] == READING, "-", "what arrives"),
-                 (own["held_against"] == TRUTH, "--", "what is missing"))  # fmt: skip
-        for chosen, style, text in kinds:
-            # Of what is missing a belief says most after looking: "filtered" goes first.
-            for _, row in own[chosen].sort_values("estimate").head(1).iterrows():
+        for target, style, text in (("reading", "-", "what arrives"),
+                                    ("truth", "--", "what is missing")):  # fmt: skip
+            # Of what is missing a belief knows most after the observation: "filtered" goes first.
+            chosen = own[own["held_against"] == target].sort_values("estimate")
+            for _, row in chosen.head(1).iterrows():
                 name = f"{label}: {text}, {row['estimate']}"
-                axis.plot(LEVELS, row[quantiles], style, color=colour, lw=1.8, label=name)
+                axis.plot(levels, row[quantiles], style, color=colour, lw=1.8, label=name)
         axis.plot([0, 1], [0, 1], color="#444444", lw=0.8)
         axis.set(xlim=(0, 1), ylim=(0, 1))
 
@@ -136,41 +112,36 @@ def _figure(
     if not cells:
         return None
     kinds = _labels(table)
-    names = list(dict.fromkeys(kinds.values()))
-    colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(names)}
-    handles: dict[str, Any] = {}
+    colour = colours(kinds)
     with mpl.rc_context(STYLE):
         columns = len(cells[0])
-        size = (_PANEL[0] * columns, height * _PANEL[1] * len(cells) + 0.4)
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(len(cells), columns, squeeze=False)
+        figure, axes = panel_grid(len(cells), columns, (_PANEL[0], height * _PANEL[1]))
         for line, drawn in zip(axes, cells, strict=True):
             for column, (axis, cell) in enumerate(zip(line, drawn, strict=True)):
                 if cell.empty:
-                    axis.axis("off")
                     continue
-                labels = cell.index.map(kinds)
-                for label in dict.fromkeys(labels):
-                    own = cell[labels == label]
+                for label, own in cell.groupby(kinds[cell.index], sort=False):
                     pooled = own[own["runs"] == own["runs"].max()]
-                    draw(axis, pooled, label, colours[label], column)
+                    draw(axis, pooled, str(label), colour[label], column)
                 if column == 0 or not drawn[0].equals(cell):
                     axis.set_title(_title(cell), fontsize=8.5, loc="left")
-                _round_ticks(axis)
-                handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+                if axis.get_yscale() == "log":
+                    axis.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+                    axis.yaxis.set_major_formatter("{x:g}")
+                    axis.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
         for axis in axes[-1]:
             axis.set_xlabel(across)
-        _legend(figure, handles, min(3, columns + 1))
+        legend_below(figure, min(3, columns + 1), fontsize=8)
     return figure
 
 
-def _labels(table: pd.DataFrame) -> Mapping[Any, str]:
+def _labels(table: pd.DataFrame) -> pd.Series:
     """Name the kind of each row: its method, and what it was trained on where that differs."""
-    told = table["method"].astype(str)
+    label = table["method"].astype(str)
     for column, text in (("trained_on", "trained on {}"), ("noise_sigma", "sigma {:g}")):
         several = table.groupby("method")[column].transform("nunique") > 1
-        told = told.where(~several, told + ", " + table[column].map(text.format))
-    return told.to_dict()
+        label = label.where(~several, label + ", " + table[column].map(text.format))
+    return label
 
 
 def _title(cell: pd.DataFrame) -> str:
@@ -178,19 +149,6 @@ def _title(cell: pd.DataFrame) -> str:
     runs, share = int(kinds["runs"].max().sum()), 100 * kinds["missing_ratio"].mean().mean()
     task, point = cell.iloc[0][["task", "point"]]
     return f"{task}, {point}, {share:.0f} % missing, {runs} run{'s' if runs > 1 else ''}"
-
-
-def _round_ticks(axis: Any) -> None:
-    """Mark 1, 2, 5 and their tenfolds on a logarithmic axis."""
-    if axis.get_yscale() == "log":
-        axis.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
-
-
-def _legend(figure: Figure, handles: Mapping[str, Any], columns: int) -> None:
-    place: Any = {"loc": "outside lower center", "ncols": columns}
-    figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, **place)
 
 
 def _curve(

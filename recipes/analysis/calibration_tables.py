@@ -10,11 +10,13 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from analysis.calibration import ALL, ARRIVED, COVERAGE, LEVELS, MISSING, Forecast, Sums, Tally
+from analysis.calibration import ALL, ARRIVED, COVERAGE, LEVELS, MISSING, Compared, Sums, Tally
+
+Row = dict[str, Any]
 
 
 class Resampling:
-    r"""Draw episodes with replacement, to tell how far a number would be off with others.
+    r"""Draw episodes with replacement: how far would a number be off with other episodes?
 
     Entries of one episode are correlated, those of two are not: whole episodes are drawn (the
     bootstrap over clusters), and a number is a ratio of sums over the drawn ones. Of few episodes
@@ -34,114 +36,94 @@ class Resampling:
         self.weights = torch.nn.functional.one_hot(drawn, episodes).sum(1).double()
 
     def ratio(
-        self, numerator: Tensor, denominator: Tensor, then: Callable[[Any], Any] = float
-    ) -> tuple[float | None, float | None, float | None]:
-        """Return a ratio of sums and its 95 % interval.
+        self,
+        name: str,
+        numerator: Tensor | None,
+        denominator: Tensor,
+        then: Callable[[Any], Any] = float,
+    ) -> Row:
+        """Return a ratio of sums over episodes and its 95 % interval, as three columns.
 
         Args:
-            numerator: sums of each episode, shape ``(episodes,)``.
-            denominator: the same shape.
+            name: of the columns: ``name``, ``name_low``, ``name_high``.
+            numerator: sums of each episode, shape ``(episodes,)``; None: all three are empty.
+            denominator: the same shape. The ends are None where fewer than two episodes count.
             then: monotonous, applied to the ratio and its ends.
-
-        Returns:
-            The number, None where there is nothing to divide by, and the ends of its interval,
-            None where fewer than two episodes have anything to say.
         """
-        if not denominator.sum() > 0:
-            return None, None, None
-        value = then((numerator.sum() / denominator.sum()).item())
-        count = int((denominator > 0).sum())
-        if count < 2:
-            return value, None, None
-        student = stats.t.ppf(0.975, count - 1) * math.sqrt(count / (count - 1))
-        levels = torch.tensor(stats.norm.cdf([-student, student]))
-        ratios = (self.weights @ numerator) / (self.weights @ denominator)
-        low, high = torch.nanquantile(ratios, levels).tolist()
-        return value, then(low), then(high)
+        value = low = high = None
+        if numerator is not None and denominator.sum() > 0:
+            value = then((numerator.sum() / denominator.sum()).item())
+            count = int((denominator > 0).sum())
+            if count > 1:
+                student = stats.t.ppf(0.975, count - 1) * math.sqrt(count / (count - 1))
+                levels = torch.tensor(stats.norm.cdf([-student, student]))
+                ratios = (self.weights @ numerator) / (self.weights @ denominator)
+                low, high = map(then, torch.nanquantile(ratios, levels).tolist())
+        return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
-def precision_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Make the rows of precision.csv: how far estimates are from the noiseless truth.
+def precision_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[Row]:
+    """Yield the rows of precision.csv: how far estimates are from the noiseless truth.
 
-    Args:
-        tally: of an agent under a condition.
-        resamples: for the intervals.
-        seed: of them.
-
-    Yields:
-        Columns and values. Steps since last seen are 0 for entries that arrived.
+    Steps since last seen are 0 for entries that arrived.
     """
     resampling = Resampling(len(tally.lengths), resamples, seed)
-    for (estimate, entries), sums in tally.errors.items():
-        for name, own in _classes(tally, sums):
-            if entries == MISSING or name == ALL:
+    for pair, sums in tally.sums.items():
+        for name, own in _classes(tally, sums) if pair.noise is None else ():
+            if pair.entries == MISSING or name == ALL:
                 yield {
-                    "estimate": estimate,
-                    "entries": entries,
-                    "steps_since_seen": "0" if entries == ARRIVED else name,
+                    "estimate": pair.estimate,
+                    "entries": pair.entries,
+                    "steps_since_seen": "0" if pair.entries == ARRIVED else name,
                     "count": int(own["count"].sum()),
-                } | _interval("rmse", resampling.ratio(own["squared"], own["count"], math.sqrt))
+                } | resampling.ratio("rmse", own["squared"], own["count"], math.sqrt)
 
 
-def calibration_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Make the rows of calibration.csv: whether claimed deviations are right.
+def calibration_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[Row]:
+    """Yield the rows of calibration.csv: whether claimed deviations are right.
 
-    Args:
-        tally: of an agent under a condition.
-        resamples: for the intervals.
-        seed: of them.
-
-    Yields:
-        Columns and values. ``consistent_low`` and ``consistent_high`` are the band in which NIS
-        over entries of a right belief lies in 95 of 100 cases.
+    ``consistent_low`` and ``consistent_high`` are the band in which NIS over entries of a right
+    belief lies in 95 of 100 cases.
     """
     resampling = Resampling(len(tally.lengths), resamples, seed)
-    for forecast, sums in tally.forecasts.items():
-        for name, own in _classes(tally, sums):
+    for pair, sums in tally.sums.items():
+        for name, own in _classes(tally, sums) if pair.noise is not None else ():
             count = own["count"]
             total = count.sum().item()
             nis = own.get("nis_joint" if name == ALL else "nis")
             band = (None, None) if nis is None else stats.chi2.ppf([0.025, 0.975], total) / total
-            row = {
-                **_columns(forecast),
+            row = _columns(pair) | {
                 "steps_since_seen": name,
                 "count": int(total),
                 "rmse": math.sqrt(own["squared"].sum() / total),
                 "claimed_std": math.sqrt(own["variance"].sum() / total),
             }
             for level in COVERAGE:
-                inside = resampling.ratio(own[f"inside_{level:g}"], count)
-                row |= _interval(f"coverage_{100 * level:g}", inside)
-            row |= _interval("crps", resampling.ratio(own["crps"], count))
+                row |= resampling.ratio(
+                    f"coverage_{100 * level:g}", own[f"inside_{level:g}"], count
+                )
+            row |= resampling.ratio("crps", own["crps"], count)
             row["log_score"] = own["log_score"].sum().item() / total
-            ratio = (None, None, None) if nis is None else resampling.ratio(nis, count)
-            row |= _interval("nis_per_dof", ratio)
+            row |= resampling.ratio("nis_per_dof", nis, count)
             yield row | {"consistent_low": band[0], "consistent_high": band[1]}
 
 
-def reliability_rows(tally: Tally) -> Iterator[dict[str, Any]]:
-    """Make the rows of reliability.csv: how often values came under their quantiles.
-
-    Args:
-        tally: of an agent under a condition.
-
-    Yields:
-        Columns and values; ``under_5`` is the share of values under the 5 % quantile.
-    """
-    for forecast, sums in tally.forecasts.items():
+def reliability_rows(tally: Tally) -> Iterator[Row]:
+    """Yield the rows of reliability.csv: ``under_5`` is the share under the 5 % quantile."""
+    for pair, sums in tally.sums.items():
         total = sums["count"].sum().item()
-        if total > 0:
+        if pair.noise is not None and total > 0:
             shares = (sums["under"].sum(0) / total).tolist()
             under = {f"under_{100 * p:g}": share for p, share in zip(LEVELS, shares, strict=True)}
-            yield {**_columns(forecast), "count": int(total), **under}
+            yield {**_columns(pair), "count": int(total), **under}
 
 
-def _columns(forecast: Forecast) -> dict[str, str]:
+def _columns(pair: Compared) -> Row:
     return {
-        "estimate": forecast.estimate,
-        "sensor_noise": "in" if forecast.noise else "out",
-        "held_against": forecast.target,
-        "entries": forecast.entries,
+        "estimate": pair.estimate,
+        "sensor_noise": "in" if pair.noise else "out",
+        "held_against": pair.target,
+        "entries": pair.entries,
     }
 
 
@@ -153,7 +135,3 @@ def _classes(tally: Tally, sums: Sums) -> Iterator[tuple[str, Sums]]:
         if sums["count"][:, index].sum() > 0:
             by_class = sums.keys() - {"under", "nis_joint"}
             yield name, {key: sums[key][:, index] for key in by_class}
-
-
-def _interval(name: str, values: tuple[float | None, float | None, float | None]) -> dict[str, Any]:
-    return dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))

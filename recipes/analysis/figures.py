@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from rendering.belief_figure import STYLE
+from rendering.style import STYLE, colours, legend_below, panel_grid
 from scipy.stats import bootstrap
 
 from analysis.runs import GROUP, THRESHOLDS
 from analysis.statistics import interquartile_mean, interval
 from analysis.tables import family, point_kind
 
-_COLOURS = (
-    *("#1f6fb4", "#d1622b", "#3a923a", "#8d5aa8", "#7f6a4f", "#c44e7f", "#5f6b73"),
-    *("#b59b00", "#17a2a2", "#222222"),
-)
 _PANEL = (4.3, 3.1)  # inches
 _COLUMNS = 3
-_RATIO = "realised missing ratio"
 # What else than the missing ratio the points of a family differ in.
 _LEVELS = {
     "outages": "mean length of an outage, steps",
@@ -39,20 +33,17 @@ _TITLES = {"mcar": "MCAR", "mar": "MAR", "nmar": "NMAR"}
 def learning_curves(training: pd.DataFrame) -> Figure | None:
     """Draw training return over environment steps, one panel a task.
 
-    Args:
-        training: of :class:`analysis.runs.Study`.
-
-    Returns:
-        The figure: interquartile mean over seeds and its 95 % interval; on complete, exact
-        observations also the paper's threshold. None where no episode has ended.
+    Interquartile mean over seeds and its 95 % interval; on complete, exact observations also the
+    paper's threshold. None where no episode has ended.
     """
     training = training.assign(label=_labels(training)).dropna(subset="return")
     panels = list(training.groupby("task"))
     if not panels:
         return None
     with mpl.rc_context(STYLE):
-        figure, axes = _panels(-(-len(panels) // _COLUMNS), min(len(panels), _COLUMNS))
-        colours = _colours(training.label)
+        columns = min(len(panels), _COLUMNS)
+        figure, axes = panel_grid(-(-len(panels) // columns), columns, _PANEL)
+        colour = colours(sorted(training.label.unique()))
         for axis, (task, rows) in zip(axes.ravel(), panels, strict=False):
             for label, runs in rows.groupby("label"):
                 curves = [
@@ -63,15 +54,12 @@ def learning_curves(training: pd.DataFrame) -> Figure | None:
                 steps = np.linspace(first, last, 200)
                 values = np.stack([np.interp(steps, *curve) for curve in curves], axis=-1)
                 ends = interval(values)
-                _band(axis, steps / 1e6, interquartile_mean(values), *ends, colours[label], label)
-            if (rows.trained_on == "none:0").all() and not rows.noise_sigma.any():
-                threshold = THRESHOLDS.get(family(rows.task).iloc[0])
-                if threshold is not None:
-                    axis.axhline(
-                        threshold, color="#999999", lw=0.8, ls=":", label="the paper asks for"
-                    )
-            axis.set_title(task)
-            axis.set_xlabel("environment steps, millions")
+                _band(axis, steps / 1e6, interquartile_mean(values), *ends, colour[label], label)
+            threshold = THRESHOLDS.get(family(rows.task).iloc[0])
+            clean = (rows.trained_on == "none:0").all() and not rows.noise_sigma.any()
+            if clean and threshold is not None:
+                axis.axhline(threshold, color="#999999", lw=0.8, ls=":", label="the paper asks for")
+            axis.set(title=task, xlabel="environment steps, millions")
         _finish(figure, axes, "raw return, training")
     return figure
 
@@ -80,8 +68,7 @@ def robustness(summary: pd.DataFrame, *, rows: str, columns: str) -> Figure | No
     """Draw return under every condition, a panel a pair of values of two columns.
 
     Args:
-        summary: rows with ``point``, ``return``, ``low``, ``high``, ``missing_ratio`` and the
-            columns of a group, such as :func:`analysis.tables.summarise` returns.
+        summary: such as :func:`analysis.tables.summarise` returns.
         rows: ``kind`` (of the conditions), ``mode`` or ``task``: what the rows of panels differ in.
         columns: the same of the columns.
 
@@ -102,18 +89,14 @@ def robustness(summary: pd.DataFrame, *, rows: str, columns: str) -> Figure | No
         return None
     lines, across = (sorted(table[name].unique()) for name in (rows, columns))
     with mpl.rc_context(STYLE):
-        figure, axes = _panels(len(lines), len(across))
-        colours = _colours(table.label)
-        for axis, (row, column) in zip(
-            axes.ravel(), [(r, c) for r in lines for c in across], strict=True
-        ):
+        figure, axes = panel_grid(len(lines), len(across), _PANEL)
+        colour = colours(sorted(table.label.unique()))
+        for place, axis in np.ndenumerate(axes):
+            row, column = lines[place[0]], across[place[1]]
             own = table[(table[rows] == row) & (table[columns] == column)]
-            if own.empty:
-                axis.axis("off")
-                continue
-            for place, (label, points) in enumerate(own.groupby("label")):
+            for index, (label, points) in enumerate(own.groupby("label")):
                 points = points.sort_values("level")
-                _points(axis, points, colours[label], str(label), nominal=place == 0)
+                _points(axis, points, colour[label], str(label), nominal=index == 0)
             axis.set_title(", ".join(_TITLES.get(str(name), str(name)) for name in (column, row)))
         _finish(figure, axes, "raw return")
     return figure
@@ -123,42 +106,30 @@ def _points(axis: Any, points: pd.DataFrame, colour: str, label: str, *, nominal
     words = _LEVELS.get(points.kind.iloc[0].split(" ")[0])
     x = points.level if words else points.missing_ratio
     _band(axis, x, points["return"], points.low, points.high, colour, label, "o-")
-    axis.set_xlabel(words or _RATIO)
+    axis.set_xlabel(words or "realised missing ratio")
     if words or not nominal:
         return
+    look: Any = {"textcoords": "offset points", "xytext": (0, 7), "ha": "center"}
     for at, height, level in zip(x, points["return"], points.level, strict=True):
         if level:
-            axis.annotate(
-                f"{level:g}",
-                (at, height),
-                textcoords="offset points",
-                xytext=(0, 7),
-                ha="center",
-                fontsize=7.5,
-                color="#666666",
-            )
+            axis.annotate(f"{level:g}", (at, height), fontsize=7.5, color="#666666", **look)
 
 
 def episode_summary(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Sum up the table of recipes/evaluate.py for :func:`robustness`.
-
-    Args:
-        episodes: one row an episode.
+    """Sum up the table of recipes/evaluate.py, one row an episode, for :func:`robustness`.
 
     Returns:
         Rows by agent, point and kind of action: the mean return and its 95 % bootstrap interval,
         over runs where there are several, else over the episodes of the one. Runs that share
-        method, task and training seed are told apart by their names.
+        method, task and training seed are distinguished by their names.
     """
-    agent = ["env", "method", "trained_on", "trained_noise_sigma"]
-    seeds = episodes.drop_duplicates(["run", *agent]).groupby([*agent, "training_seed"]).run
-    twice = seeds.nunique()[lambda count: count > 1].reset_index()[agent].drop_duplicates()
-    ambiguous = episodes.merge(twice, on=agent, how="left", indicator=True)._merge == "both"
-    episodes = episodes.assign(settings=episodes.run.where(ambiguous.to_numpy(), ""))
     # The noise of the condition stands in its name.
     episodes = episodes.drop(columns="noise_sigma", errors="ignore")
-    names = {"env": "task", "trained_noise_sigma": "noise_sigma"}
-    episodes = episodes.rename(columns=names)
+    episodes = episodes.rename(columns={"env": "task", "trained_noise_sigma": "noise_sigma"})
+    agent = ["task", "method", "trained_on", "noise_sigma"]
+    twins = episodes.groupby([*agent, "training_seed"]).run.transform("nunique") > 1
+    twins = twins.groupby([episodes[name] for name in agent]).transform("any")
+    episodes = episodes.assign(settings=episodes.run.where(twins, ""))
     out = []
     for key, rows in episodes.groupby([*GROUP, "point", "mode"], sort=False):
         runs = rows.groupby("run")["return"].mean()
@@ -175,37 +146,22 @@ def episode_summary(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw_evaluation(episodes: pd.DataFrame) -> dict[str, Figure]:
-    """Draw the table of recipes/evaluate.py, one figure a task, a row of panels a kind of action.
+    """Draw the table of recipes/evaluate.py: by task a figure, a row of panels a kind of action.
 
-    Args:
-        episodes: one row an episode.
-
-    Returns:
-        Figures by task; none for a task without two levels of anything.
+    A task without two levels of anything has none.
     """
-    summary = episode_summary(episodes)
     drawn = {
         str(task): robustness(rows, rows="mode", columns="kind")
-        for task, rows in summary.groupby("task")
+        for task, rows in episode_summary(episodes).groupby("task")
     }
     return {task: figure for task, figure in drawn.items() if figure is not None}
 
 
 def _labels(table: pd.DataFrame) -> pd.Series:
-    """Return what tells the groups of a table apart, their task left out."""
+    """Return labels that distinguish the groups of a table, their task left out."""
     varying = [name for name in GROUP[2:] if table.groupby("task")[name].nunique().gt(1).any()]
     parts = table[["method", *varying]].map(lambda v: v if isinstance(v, str) else f"sigma {v:g}")
     return parts.agg(lambda row: ", ".join(part for part in row if part), axis=1)
-
-
-def _colours(labels: Sequence[str] | pd.Series) -> dict[Any, str]:
-    return {label: _COLOURS[i % len(_COLOURS)] for i, label in enumerate(sorted(set(labels)))}
-
-
-def _panels(lines: int, columns: int) -> tuple[Figure, Any]:
-    size = (max(_PANEL[0] * columns, 5.0), _PANEL[1] * lines + 0.4)
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(lines, columns, squeeze=False)
 
 
 def _band(
@@ -216,15 +172,6 @@ def _band(
 
 
 def _finish(figure: Figure, axes: Any, label: str) -> None:
-    """Switch off empty panels and put one legend below all, each label once."""
-    found: dict[str, Any] = {}
-    for axis in axes.ravel():
-        if not axis.has_data():
-            axis.axis("off")
-        for handle, text in zip(*axis.get_legend_handles_labels(), strict=True):
-            found.setdefault(text, handle)
     for axis in axes[:, 0]:
         axis.set_ylabel(label)
-    columns = min(len(found), 6 if axes.shape[1] > 1 else 3)
-    handles, texts = list(found.values()), list(found)
-    figure.legend(handles, texts, loc="outside lower center", ncol=columns, frameon=False)
+    legend_below(figure, 6 if axes.shape[1] > 1 else 3)

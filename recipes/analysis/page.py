@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from analysis.runs import GROUP, THRESHOLDS, Study
@@ -51,18 +52,9 @@ def page(
     notes: str,
     folder: str,
 ) -> str:
-    """Write the page.
+    """Return the page in Markdown.
 
-    Args:
-        study: its tables.
-        tables: ``summary``, ``aggregate``, ``comparison``; see :mod:`analysis.tables`.
-        figures: names of the PNG files beside the page.
-        title: its heading.
-        notes: what a person says about it, Markdown; put below the heading as it is.
-        folder: name of the folder of the study.
-
-    Returns:
-        Markdown.
+    Figures are the names of PNG files beside the page; notes are put below the heading as they are.
     """
     summary, runs = tables["summary"], study.runs
     parts = [f"# {title}", notes.strip()]
@@ -73,8 +65,8 @@ def page(
     parts += [_READING, *(f"![{_FIGURES[name]}]({name})" for name in figures)]
     parts += ["## Training", _TRAINING, _training(summary, runs)]
     if runs.overrides.any():
-        told = runs.groupby("method").overrides.unique().map("; ".join)
-        parts += ["Settings in which the runs differ:", _markdown(told.reset_index())]
+        settings = runs.groupby("method").overrides.unique().map("; ".join)
+        parts += ["Settings in which the runs differ:", _markdown(settings.reset_index())]
     tested = summary[summary.point != TRAINING]
     for mode, rows in tested.groupby("mode", sort=False):
         parts += [f"## Evaluation, {mode} actions", _EVALUATION, _evaluation(rows)]
@@ -157,47 +149,50 @@ def _evaluation(rows: pd.DataFrame) -> str:
 
 
 def _comparison(table: pd.DataFrame) -> str:
-    table = _conditions(table)
-    for name in ("margin", "paper"):
-        if name not in table:
-            table[name] = float("nan")
+    table = _conditions(table.assign(**{n: table.get(n, np.nan) for n in ("margin", "paper")}))
     names = {"name": "probability", "low": "probability_low", "high": "probability_high"}
-    margin = [
-        "" if row.margin != row.margin else f"{row.margin:+.0%}"
-        + ("" if row.low != row.low else f" [{row.low:+.0%}, {row.high:+.0%}]")
-        for row in table.itertuples()
+    shown = [
+        {
+            "steps": "" if r.steps != r.steps else f"{r.steps:,.0f}"
+            + (f" and {r.steps_over:,.0f}" if r.steps != r.steps_over else ""),
+            "margin": _percent(r.margin)
+            + (f" [{_percent(r.low)}, {_percent(r.high)}]" if r.low == r.low else ""),
+            "probability": _interval(r, **names),
+            "paper": _percent(r.paper),
+        }
+        for _, r in table.iterrows()
     ]  # fmt: skip
-    shown = table[["task", "trained_on", "point", "method", "over"]].assign(
-        steps=[
-            "" if s != s else f"{s:,.0f}" if s == o else f"{s:,.0f} and {o:,.0f}"
-            for s, o in zip(table.steps, table.steps_over, strict=True)
-        ],
-        margin=margin,
-        probability=table.apply(_interval, axis=1, **names),
-        paper=["" if paper != paper else f"{paper:+.0%}" for paper in table.paper],
-    )
-    return _markdown(shown.rename(columns={"point": "evaluated on"}))
+    first = table[["task", "trained_on", "point", "method", "over"]].reset_index(drop=True)
+    first = first.rename(columns={"point": "evaluated on"})
+    return _markdown(pd.concat([first, pd.DataFrame(shown)], axis=1))
+
+
+def _percent(value: float) -> str:
+    return "" if pd.isna(value) else f"{value:+.0%}"
 
 
 def _efficiency(runs: pd.DataFrame) -> str:
     rows = []
-    for key, members in runs.groupby(["task", "method", "settings"]):
+    for (task, method, settings), members in runs.groupby(["task", "method", "settings"]):
+        top = members.top_10_return.to_numpy(float)
         steps = [number(s) or "not reached" for s in members.steps_to_threshold]
         rows.append(
-            dict(zip(("task", "method", "settings"), key, strict=True))
-            | {"top-10 return": number(interquartile_mean(members.top_10_return.to_numpy(float)))}
-            | {"of each seed": ", ".join(map(number, members.top_10_return))}
-            | {"threshold": number(family(members.task).map(THRESHOLDS).iloc[0])}
-            | {"steps to it": ", ".join(steps)}
+            {
+                "task": task,
+                "method": method,
+                "settings": settings,
+                "top-10 return": number(interquartile_mean(top)),
+                "of each seed": ", ".join(map(number, top)),
+                "threshold": number(family(members.task).map(THRESHOLDS).iloc[0]),
+                "steps to it": ", ".join(steps),
+            }
         )
     return _markdown(pd.DataFrame(rows))
 
 
 def _versions(runs: pd.DataFrame) -> str:
-    names = [
-        name for name in ("git_commit", "torch", "torchrl", "gymnasium", "mujoco") if name in runs
-    ]
     return "\n".join(
         f"- {name.replace('git_', '')}: {', '.join(runs[name].dropna().astype(str).unique())}"
-        for name in names
+        for name in ("git_commit", "torch", "torchrl", "gymnasium", "mujoco")
+        if name in runs
     )

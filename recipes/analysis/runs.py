@@ -143,12 +143,11 @@ def read_runs(
         )
     keys = [runs.loc[[i], RUN] for i in runs.index]
     thinned = [_thinned(curve, rows) for curve in curves]
-    tables = [runs]
-    for parts in (thinned, tested):
-        tables.append(
-            pd.concat(k.merge(part, how="cross") for k, part in zip(keys, parts, strict=True))
-        )
-    return Study(*(table.sort_values(RUN, kind="stable") for table in tables))
+    joined = [
+        pd.concat(key.merge(part, how="cross") for key, part in zip(keys, parts, strict=True))
+        for parts in (thinned, tested)
+    ]
+    return Study(*(table.sort_values(RUN, kind="stable") for table in (runs, *joined)))
 
 
 def _run(
@@ -203,14 +202,9 @@ def _evaluations(
 
 
 def over_episodes(episodes: pd.DataFrame, table: str = "") -> pd.DataFrame:
-    """Sum up a table of recipes/evaluate.py over the episodes of a point and kind of action.
+    """Sum up a table of recipes/evaluate.py, of one run, over the episodes of a condition.
 
-    Args:
-        episodes: one row an episode, of one run.
-        table: its name.
-
-    Returns:
-        Rows as in evaluation.csv; missing ratio and log-likelihood over all steps and entries.
+    Rows as in evaluation.csv; missing ratio and log-likelihood are over all steps and entries.
     """
     arrived = episodes.length * (1 - episodes.missing_ratio)
     nats = arrived * episodes.get("log_likelihood", np.nan)

@@ -1,7 +1,7 @@
 r"""Proper scores of Gaussian predictions, entry by entry: claiming another variance never pays.
 
 [Gneiting 2007] is Gneiting, Raftery, *Strictly Proper Scoring Rules, Prediction, and Estimation*,
-JASA 102.
+JASA 102. Values, means and deviations broadcast.
 """
 
 from __future__ import annotations
@@ -15,19 +15,11 @@ _LOG_2PI = math.log(2 * math.pi)
 
 
 def gaussian_pit(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    r"""Return the probability that was given to values under the one that came.
+    r"""Return the predicted probability of values under the one that occurred.
 
     .. math:: u = \Phi\left( (x - \mu) / \sigma \right)
 
     The probability integral transform: uniform on [0, 1] if the distributions are right.
-
-    Args:
-        value: x, any shape.
-        mean: broadcasts with ``value``.
-        std: broadcasts with ``value``, positive.
-
-    Returns:
-        The broadcast shape, in [0, 1].
     """
     return torch.special.ndtr((value - mean) / std)
 
@@ -37,15 +29,8 @@ def gaussian_crps(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 
     .. math:: \sigma \left( z (2 \Phi(z) - 1) + 2 \varphi(z) - \pi^{-1/2} \right)
 
-    Eq. (21) [Gneiting 2007], with the sign turned: smaller is better, 0 is perfect.
-
-    Args:
-        value: x, any shape.
-        mean: broadcasts with ``value``.
-        std: broadcasts with ``value``; 0 leaves the absolute error.
-
-    Returns:
-        The broadcast shape, units of ``value``.
+    Eq. (21) [Gneiting 2007], with the sign turned: smaller is better, 0 is perfect. In units of
+    ``value``; a ``std`` of 0 leaves the absolute error.
     """
     error = value - mean
     z = error / std.clamp_min(torch.finfo(std.dtype).tiny)
@@ -56,16 +41,8 @@ def gaussian_crps(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 
 
 def gaussian_log_score(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    r"""Score by minus the log-density of what came.
+    r"""Score by minus the log-density of what occurred, nats; smaller is better.
 
     .. math:: \tfrac12 \left( z^2 + \log \sigma^2 + \log 2\pi \right)
-
-    Args:
-        value: x, any shape.
-        mean: broadcasts with ``value``.
-        std: broadcasts with ``value``, positive.
-
-    Returns:
-        The broadcast shape, nats; smaller is better.
     """
     return 0.5 * (((value - mean) / std).square() + _LOG_2PI) + std.log()

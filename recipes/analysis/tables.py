@@ -14,6 +14,7 @@ NOTHING_MISSING, TRAINING, ALL_TASKS = "none:0", "training", "all tasks"
 # By how much the paper's DRBPN is ahead of its DVRL at missing ratio .5.
 MARGINS_OVER_DVRL = {"Hopper": 0.20, "Walker2d": 0.75, "HalfCheetah": 1.00}
 _WHERE = ["trained_on", "noise_sigma", "settings", "point", "mode"]
+_HALF = ("mcar", "mar", "nmar", "reduction model", "reduction random")
 _KINDS = (
     *("none", "mar", "mcar", "nmar", "outages", "delay", "multi_rate", "reduction"),
     *("noise", "spikes", "stuck", "drift"),
@@ -23,11 +24,7 @@ _KINDS = (
 def point_kind(point: str) -> tuple[str, float]:
     """Return what points have in common that differ in one number, and that number.
 
-    Args:
-        point: such as ``mcar:0.5``, ``reduction:0.5:random`` or ``outages:0.5:20:sensor``.
-
-    Returns:
-        Such as ``("mcar", 0.5)``, ``("reduction random", 0.5)``, ``("outages 0.5 sensor", 20)``.
+    ``mcar:0.5`` gives ``("mcar", 0.5)``, ``outages:0.5:20:sensor`` ``("outages 0.5 sensor", 20)``.
     """
     family, *words = point.split(":")
     level = words.pop(1 if family == "outages" and len(words) > 1 else 0) if words else "0"
@@ -56,17 +53,12 @@ def last_evaluations(study: Study) -> pd.DataFrame:
 
 
 def summarise(study: Study) -> pd.DataFrame:
-    """Return means over seeds.
+    """Return means over the seeds of a study.
 
-    Args:
-        study: its tables.
-
-    Returns:
-        Rows for each group, point (``training``: the last 100 training episodes) and kind of
-        action: interquartile mean and ends of its 95 % interval, the share of the return with
-        nothing missing (a ratio of interquartile means), means of the other columns, and every
-        seed's own return. A group in which a seed has no number has no row at a point, and no
-        mean of its training.
+    Rows for each group, point (``training``: the last 100 training episodes) and kind of action:
+    interquartile mean and ends of its 95 % interval, the share of the return with nothing missing
+    (a ratio of interquartile means), means of the other columns, and every seed's own return. A
+    group in which a seed has no number has no row at a point, and no mean of its training.
     """
     training = study.runs.rename(columns={"return": "return_mean"})
     rows = pd.concat([training.assign(point=TRAINING, mode="sampled"), last_evaluations(study)])
@@ -91,8 +83,8 @@ def summarise(study: Study) -> pd.DataFrame:
     summary = pd.DataFrame(out)
     whole = summary[summary.point == NOTHING_MISSING][[*GROUP, "mode", "return"]]
     summary = summary.merge(whole, on=[*GROUP, "mode"], how="left", suffixes=("", "_whole"))
-    told = (summary.return_whole > 0) & ~summary.point.isin([TRAINING, NOTHING_MISSING])
-    summary.insert(11, "share", (summary["return"] / summary.return_whole).where(told))
+    defined = (summary.return_whole > 0) & ~summary.point.isin([TRAINING, NOTHING_MISSING])
+    summary.insert(11, "share", (summary["return"] / summary.return_whole).where(defined))
     summary["order"] = point_order(summary.point)
     summary = summary.sort_values([*GROUP, "mode", "order"], kind="stable")
     sampled_first = summary["mode"].map({"sampled": 0}).fillna(1).argsort(kind="stable")
@@ -100,24 +92,12 @@ def summarise(study: Study) -> pd.DataFrame:
 
 
 def derived_tables(study: Study, reference: str) -> dict[str, pd.DataFrame]:
-    """Return ``summary``, ``aggregate`` and ``comparison`` of a study, by name.
-
-    Args:
-        study: its tables.
-        reference: method that the others are compared with.
-    """
+    """Return ``summary``, ``aggregate`` and ``comparison``, of the reference with others."""
     summary = summarise(study)
-    return {
-        "summary": summary,
-        "aggregate": aggregate(study, summary),
-        "comparison": compare(study, summary, reference),
-    }
-
-
-def _complete(study: Study, summary: pd.DataFrame) -> pd.DataFrame:
-    """Return the last evaluations of groups of which every seed was evaluated at the point."""
-    keys = [*GROUP, "point", "mode"]
-    return last_evaluations(study).merge(summary[keys], on=keys)
+    # Evaluations of groups of which every seed was evaluated at the point.
+    rows = last_evaluations(study).merge(summary[[*GROUP, "point", "mode"]])
+    comparison = compare(study, rows, reference)
+    return {"summary": summary, "aggregate": aggregate(rows), "comparison": comparison}
 
 
 def family(tasks: Any) -> Any:
@@ -125,18 +105,12 @@ def family(tasks: Any) -> Any:
     return tasks.str.rsplit("-", n=1).str[0]
 
 
-def aggregate(study: Study, summary: pd.DataFrame) -> pd.DataFrame:
+def aggregate(rows: pd.DataFrame) -> pd.DataFrame:
     """Return interquartile means over all runs of all tasks, as shares of the paper's thresholds.
 
-    Args:
-        study: its tables.
-        summary: of :func:`summarise`.
-
-    Returns:
-        Rows where two tasks or more with a positive threshold were evaluated; a method that lacks
-        one of them has none.
+    Rows where two tasks or more with a positive threshold were evaluated; a method that lacks one
+    of them has none.
     """
-    rows = _complete(study, summary)
     rows = rows.assign(score=rows.return_mean / family(rows.task).map(THRESHOLDS))
     rows = rows[family(rows.task).map(THRESHOLDS) > 0]
     out = []
@@ -152,21 +126,14 @@ def aggregate(study: Study, summary: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def compare(study: Study, summary: pd.DataFrame, reference: str) -> pd.DataFrame:
+def compare(study: Study, rows: pd.DataFrame, reference: str) -> pd.DataFrame:
     """Compare a method with every other where half of all entries may be missing.
 
-    Args:
-        study: its tables.
-        summary: of :func:`summarise`.
-        reference: the method.
-
-    Returns:
-        Rows: ratio of interquartile means less one with its 95 % interval (none where the other
-        has a return that is not positive); the probability that a run of the reference beats one
-        of the other; environment steps of both. Where these differ, a further row compares their
-        training returns at equal steps. Task ``all tasks``: the mean probability.
+    Rows, of the last evaluations: ratio of interquartile means less one with its 95 % interval
+    (none where the other has a return that is not positive); the probability that a run of the
+    reference beats one of the other; environment steps of both. Where these differ, a further row
+    compares their training returns at equal steps. Task ``all tasks``: the mean probability.
     """
-    rows = _complete(study, summary)
     rows = rows[[point_kind(p)[0] in _HALF and point_kind(p)[1] == 0.5 for p in rows.point]]
     rows = pd.concat([rows, _at_equal_steps(study, reference)])
     out: list[dict[str, Any]] = []
@@ -191,9 +158,6 @@ def compare(study: Study, summary: pd.DataFrame, reference: str) -> pd.DataFrame
     return table
 
 
-_HALF = ("mcar", "mar", "nmar", "reduction model", "reduction random")
-
-
 def _comparison(pairs: list[list[Any]]) -> dict[str, float]:
     flat = [sample for pair in pairs for sample in pair]
     low, high = interval(*flat, statistic=probability_of_improvement)
@@ -210,20 +174,16 @@ def _comparison(pairs: list[list[Any]]) -> dict[str, float]:
 
 def _at_equal_steps(study: Study, reference: str) -> pd.DataFrame:
     """Return training returns at the steps of the shorter, where methods of a task differ."""
-    out = []
+    out = [study.training.head(0)]
+    shared = [name for name in GROUP if name != "method"]
     lengths = study.runs.groupby(GROUP, as_index=False).frames.min()
-    own = lengths[lengths.method == reference]
-    pairs = own.merge(lengths, on=[name for name in GROUP if name != "method"])
+    pairs = lengths[lengths.method == reference].merge(lengths, on=shared)
     for _, pair in pairs[pairs.frames_x != pairs.frames_y].iterrows():
         frames = min(pair.frames_x, pair.frames_y)
         curves = study.training[study.training.frames <= frames].dropna(subset="return")
+        here = curves[(curves[shared] == pair[shared]).all(axis=1)]
         for name in (reference, pair.method_y):
-            there = curves[
-                (
-                    curves[GROUP]
-                    == pair.rename({"method_y": "method"})[GROUP].replace({pair.method_y: name})
-                ).all(axis=1)
-            ]
-            out.append(there.groupby(RUN, as_index=False).tail(1).assign(frames=frames))
-    found = pd.concat(out) if out else study.training.head(0)
+            last = here[here.method == name].groupby(RUN, as_index=False).tail(1)
+            out.append(last.assign(frames=frames))
+    found = pd.concat(out) if len(out) > 1 else out[0]
     return found.rename(columns={"return": "return_mean"}).assign(point=TRAINING, mode="sampled")

@@ -11,12 +11,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
-from training.config import (
-    GROUPINGS,
-    choice,
-    missingness_kind,
-    missingness_name,
-)
+from training.config import GROUPINGS, choice, missingness_kind, missingness_name
 from training.errors import UserError
 
 from evaluation.sensor_choice import kept_sensors
@@ -68,15 +63,12 @@ class Condition:
 
 
 def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Condition:
-    """Read a condition.
+    """Read a condition such as ``mcar:0.5``, see conf/evaluate.yaml.
 
     Args:
-        text: such as ``mcar:0.5``, see conf/evaluate.yaml.
+        text: the condition.
         settings: configuration of the run: what the text does not name stays.
         spike_std: deviation of spikes where the text gives none, raw units.
-
-    Returns:
-        The condition.
 
     Raises:
         UserError: if the text can't be read.
@@ -129,7 +121,10 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
             eta, mean, by = _number(share, 1.0), _number(length), rest[0] if rest else "sensor"
             if eta is not None and mean is not None and by in GROUPINGS:
                 out = choice("missingness", "outages", eta=eta, mean_length=mean, group_by=by)
-                _check_outages(eta, mean)
+                try:
+                    outage_rates(eta, mean)
+                except ValueError as error:
+                    raise UserError(f"missingness=outages: {error}") from error
                 return Condition(missingness_name(out), "outages", out, noise)
         case [family, share] if family in _MECHANISMS and (eta := _number(share, 1.0)) is not None:
             changed = _mechanism(family, eta, missing)
@@ -148,16 +143,7 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
 def parse_conditions(
     texts: Sequence[Any], settings: DictConfig, *, spike_std: float
 ) -> list[Condition]:
-    """Read conditions; one that comes twice, under two names perhaps, is one.
-
-    Args:
-        texts: see conf/evaluate.yaml.
-        settings: configuration of the run.
-        spike_std: deviation of spikes where a text gives none, raw units.
-
-    Returns:
-        Different conditions.
-    """
+    """Read conditions; one that comes twice, under two names perhaps, is one."""
     read = [parse_condition(str(text), settings, spike_std=spike_std) for text in texts]
     return list({condition.name: condition for condition in read}.values())
 
@@ -165,15 +151,12 @@ def parse_conditions(
 def default_conditions(
     levels: Mapping[str, Sequence[Any]], *, full: bool, model: bool
 ) -> list[str]:
-    """Return the conditions of an evaluation that names none.
+    """Return the conditions of an evaluation that names none, as text.
 
     Args:
         levels: ``grid`` of conf/evaluate.yaml. Ratio 0 is the same in every family: once.
         full: whether to go beyond MCAR, MAR and sensor reduction.
         model: whether the agent has a model that can choose sensors.
-
-    Returns:
-        Conditions as text, in the order of evaluation.
     """
     ratios = [ratio for ratio in levels["ratios"] if ratio > 0]
     out = ["none:0"] if len(ratios) < len(levels["ratios"]) else []
@@ -200,21 +183,12 @@ def default_conditions(
 def removed_sensors(
     condition: Condition, trained: TrainedAgent, *, episodes: int, reduction_seed: int
 ) -> Tensor | None:
-    """Return the sensors that a condition takes away for good.
+    """Return the sensors that a condition takes away for good, ``(episodes, obs)``; None: none.
 
     At random, every episode lacks sensors of its own: a mean over episodes is one over choices too.
     The order in which an episode loses sensors is drawn from ``reduction_seed`` and its number
     alone, so that every agent of a task meets the same choices, and those of a smaller ratio are
-    among those of a larger one.
-
-    Args:
-        condition: the condition.
-        trained: the agent, whose model may choose; its one choice holds for every episode.
-        episodes: how many.
-        reduction_seed: of the random choices.
-
-    Returns:
-        Bool of shape ``(episodes, obs)``, True where there is no sensor; None: all are there.
+    among those of a larger one. By the agent's model, one choice holds for every episode.
 
     Raises:
         UserError: if the model is to choose and there is none.
@@ -247,14 +221,6 @@ def _mechanism(family: str, eta: float, trained: DictConfig) -> DictConfig:
         if key in node and key in trained:
             node[key] = trained[key]
     return node
-
-
-def _check_outages(eta: float, mean_length: float) -> None:
-    """Refuse a ratio and a mean length of which there is no Markov chain."""
-    try:
-        outage_rates(eta, mean_length)
-    except ValueError as error:
-        raise UserError(f"missingness=outages: {error}") from error
 
 
 def _whole(text: str) -> int | None:

@@ -13,21 +13,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from training.agent import Agent, add_primers
-from training.envs import make_env
+from training.agent import Agent
 
-from torchrl_drbpn import SensorReduction, seed_env
+from torchrl_drbpn import seed_env
 
 BLOCK = 32
 _KINDS = {"sampled": ExplorationType.RANDOM, "mean": ExplorationType.DETERMINISTIC}
-# Of features. Observations are normalised: a million deviations from all that was ever seen is no
-# belief any more, and on its way to infinity.
+# Of features. Observations are normalised: a belief a million deviations off has diverged.
 _FARTHEST = 1e6
 
 Watch = Callable[[slice, TensorDictBase, Tensor], None]
@@ -79,43 +76,6 @@ class Episodes:
         return float(arrived @ np.array(self.log_likelihoods) / max(arrived.sum(), 1e-12))
 
 
-def make_evaluation_environment(
-    config: DictConfig,
-    agent: Agent,
-    *,
-    missingness: DictConfig | None = None,
-    noise: DictConfig | None = None,
-    complete: bool = False,
-    removed: Tensor | None = None,
-) -> TransformedEnv:
-    """Build a batch of `BLOCK` environments like the training ones.
-
-    Args:
-        config: of the run.
-        agent: whose recurrent state is carried.
-        missingness: what does not arrive; None: as in training.
-        noise: what is added; None: as in training.
-        complete: whether to write ``complete_observation`` too, for measurements alone.
-        removed: components that never arrive, on top of ``missingness``: bool of shape
-            ``(BLOCK, obs)``; None: there are none.
-
-    Returns:
-        The environment.
-    """
-    changed = config.copy()
-    changed.missingness = missingness or config.missingness
-    changed.noise = noise or config.noise
-    env = make_env(
-        changed,
-        num_envs=BLOCK,
-        seed=config.evaluation.seed,
-        complete=complete,
-        transforms={} if removed is None else {"reduction": SensorReduction(removed)},
-    )
-    add_primers(env, agent)
-    return env
-
-
 def evaluate(
     policy: TensorDictModuleBase,
     make_env: Callable[[int], TransformedEnv],
@@ -125,19 +85,7 @@ def evaluate(
     seed: int,
     stop: Callable[[], bool] = lambda: False,
 ) -> Episodes | None:
-    """Run episodes and add up what came of each.
-
-    Args:
-        policy: belief module and policy head.
-        make_env: see :func:`run_episodes`.
-        episodes: how many.
-        mode: ``sampled`` actions or ``mean`` actions.
-        seed: of episodes, corruption and sampled actions.
-        stop: asked at every step; if it returns True the evaluation is given up.
-
-    Returns:
-        The episodes, or None if it was given up.
-    """
+    """Run episodes, see :func:`run_episodes`, and sum up each; None if they were given up."""
     returns, likelihoods = torch.zeros(2, episodes, dtype=torch.float64)
     lengths, entries, observed = torch.zeros(3, episodes, dtype=torch.int64)
     diverged = torch.zeros(episodes, dtype=torch.bool)
@@ -187,17 +135,13 @@ def run_episodes(
 
     Args:
         policy: belief module and policy head.
-        make_env: builds the environment of the block of this number, batch size ``(BLOCK,)``; it is
-            closed afterwards.
+        make_env: builds the environment of the block of this number, batch size ``(BLOCK,)``.
         episodes: how many.
         mode: ``sampled`` actions or ``mean`` actions.
         seed: of episodes, corruption and sampled actions.
         watch: called after every step with the episodes of the block, the stepped tensordict of
             these, and whether each was still running before the step, ``(episodes of the block,)``.
-        stop: asked at every step; if it returns True the episodes are given up.
-
-    Returns:
-        Whether every episode came to its end.
+        stop: asked at every step; if it returns True the episodes are given up: False comes back.
     """
     with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(_KINDS[mode]):
         for block, first in enumerate(range(0, episodes, BLOCK)):
@@ -208,7 +152,7 @@ def run_episodes(
                 torch.manual_seed(own)
                 seed_env(env, own)
                 running = (torch.arange(BLOCK) < count).unsqueeze(-1)
-                root = leave_standing(env.reset(), running)
+                root = _leave_standing(env.reset(), running)
                 while running.any():
                     if stop():
                         return False
@@ -216,20 +160,12 @@ def run_episodes(
                     data = env.step(policy(root).set("_step", running))
                     watch(rows, data[:count], running[:count, 0])
                     running = running & ~data.get(("next", "done"))
-                    root = leave_standing(env.step_mdp(data), running)
+                    root = _leave_standing(env.step_mdp(data), running)
     return True
 
 
-def leave_standing(root: TensorDictBase, running: Tensor) -> TensorDictBase:
-    """Let the beliefs of episodes that are over begin anew.
-
-    Args:
-        root: of the next step; changed in place.
-        running: bool of shape ``(BLOCK, 1)``.
-
-    Returns:
-        The same tensordict.
-    """
+def _leave_standing(root: TensorDictBase, running: Tensor) -> TensorDictBase:
+    """Let the beliefs of episodes that are over begin anew, in place."""
     if not running.all():
         root.set("is_init", root.get("is_init") | ~running)
         carried = root.get("recurrent", None)
@@ -247,10 +183,7 @@ class StoppingPolicy(TensorDictModuleBase):
     """Act as ``agent.policy``; where the belief has diverged, with zero actions to the end.
 
     Without its sensors a learned transition runs open loop and need not be stable. In training that
-    is an error; under test it is a result: ``diverged`` says so, and the other episodes go on.
-
-    Args:
-        agent: whose modules decide.
+    is an error; under test it is a result: ``diverged`` marks it, and the other episodes go on.
     """
 
     def __init__(self, agent: Agent) -> None:

@@ -1,4 +1,4 @@
-"""Run folders that a command line names."""
+"""Folders that a command line names."""
 
 from __future__ import annotations
 
@@ -7,19 +7,16 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from training.checkpoint import checkpoint_frames
 from training.console import say
 from training.errors import UserError
 
 
 def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
-    """Return run folders in a fixed order.
+    """Return run folders, each once, sorted.
 
     Args:
-        wanted: folders or patterns; a folder that exists is no pattern, whatever its name holds.
-
-    Returns:
-        Folders, each once, sorted. A pattern gives the folders with a config.yaml.
+        wanted: folders or patterns; a folder that exists is no pattern, whatever its name holds. A
+            pattern gives the folders with a config.yaml.
 
     Raises:
         UserError: if there is none, or one that is named does not exist.
@@ -46,35 +43,30 @@ def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
 
 
 def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
-    """Leave out runs that have not got to their first checkpoint, and say so.
+    """Leave out runs before their first checkpoint, with a line.
 
-    Args:
-        folders: run folders.
-
-    Returns:
-        Those with a checkpoint; all, where none has one: reading the first says what is wrong.
+    If none has one, all are returned: reading the first says what is wrong.
     """
-    found = [
-        folder
-        for folder in folders
-        if checkpoint_frames(folder) is not None or any(folder.glob("*.safetensors"))
-    ]
+    kinds = ("checkpoints/*.pt", "*.safetensors")
+    found = [folder for folder in folders if any(any(folder.glob(kind)) for kind in kinds)]
     for folder in folders if found else ():
         if folder not in found:
             say(f"{folder.name}: left out, it has no checkpoint yet")
     return found or list(folders)
 
 
+def output_folder(out: str | None, folders: Sequence[Path]) -> Path:
+    """Return the folder for tables and figures: ``out``, or the one of the only run."""
+    if out is None and len(folders) > 1:
+        raise UserError(f"`out` must name a folder for {len(folders)} runs: out=results/<study>.")
+    path = Path(out or folders[0])
+    if path.exists() and not path.is_dir():
+        raise UserError(f"`out` must be a folder, {path} is a file.")
+    return path
+
+
 def override(key: str, value: object) -> str:
-    """Return ``key=value`` as it can be pasted into a shell, for Hydra to read.
-
-    Args:
-        key: of the configuration.
-        value: its value, such as a path whose name holds blanks, commas or brackets.
-
-    Returns:
-        A word of a command line, quoted where it must be.
-    """
+    """Return ``key=value`` as a word that can be pasted into a shell, for Hydra to read."""
     text = str(value)
     if not all(c.isalnum() or c in "/_-.+:" for c in text):
         # Hydra reads a backslash as itself, except before a quote.

@@ -61,17 +61,16 @@ class SensorModel:
         return select_sensors(H, P, R, len(self.names), criterion=criterion, target=target).indices
 
     def along(self, orders: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return what sensors tell, read in a given order.
+        r"""Return the information of the first k sensors of an order, and what they leave.
 
         With L L' the covariance of the readings in that order, and N N' that of their noise, the
-        readings up to k tell sum_{i <= k} log(L_ii / N_ii) nats about the state.
+        readings up to k hold sum_{i <= k} log(L_ii / N_ii) nats on the state.
 
         Args:
             orders: indices of sensors, shape ``(*batch, count)``.
 
         Returns:
-            The information of the first k sensors, nats, and the share of tr H P H' that they
-            leave, each of shape ``(*batch, count)``.
+            Information, nats, and the share of tr H P H' that is left, both ``(*batch, count)``.
         """
         pairs = orders.unsqueeze(-1), orders.unsqueeze(-2)
         readings = torch.linalg.cholesky(self.observation_cov[pairs])
@@ -85,13 +84,7 @@ class SensorModel:
 
 
 def learned_sensors(trained: TrainedAgent) -> SensorModel:
-    """Read H, P and R from a trained belief.
-
-    Args:
-        trained: the agent; its belief must be the belief filter.
-
-    Returns:
-        The model of its sensors.
+    """Read H, P and R from a trained belief filter.
 
     Raises:
         UserError: if the belief has no H, P and R, or no P that holds at every step.
@@ -125,16 +118,5 @@ def learned_sensors(trained: TrainedAgent) -> SensorModel:
 
 
 def kept_sensors(trained: TrainedAgent, count: int) -> list[int]:
-    """Return the sensors that tell most about the state, by the learned H, P and R, best first.
-
-    Greedy D-optimal, see :func:`torchrl_drbpn.select_sensors`; the first sensors of a larger count
-    are those of a smaller one.
-
-    Args:
-        trained: the agent; its belief must be the belief filter.
-        count: how many sensors to keep.
-
-    Raises:
-        UserError: if the belief has no H, P and R.
-    """
+    """Return the sensors with most information on the state, by the learned model, best first."""
     return learned_sensors(trained).ranking("D")[:count].tolist()

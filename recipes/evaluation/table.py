@@ -6,21 +6,15 @@ evaluation killed at any moment goes on where it was.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import lru_cache
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
-from training.config import missingness_name
-from training.envs import env_name
+from joblib import Parallel, delayed
 from training.errors import UserError
 from training.run_folder import write_whole
 
@@ -34,6 +28,7 @@ _COLUMNS = {*_KEY, "env", "method", "training_seed", "frames", "seed", "reductio
 _AGAIN = "name another `output`, or overwrite=true begins anew."
 
 Task = tuple[Path, Condition, Sequence[str]]  # run folder, condition, kinds of action
+Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -48,24 +43,18 @@ class Protocol:
 
 
 class Table:
-    """One row an episode, as text.
-
-    Args:
-        path: CSV file; what it holds is kept.
-        protocol: how conditions are evaluated.
-        agents: :func:`identity` of each run, by the name of its folder.
-        overwrite: begin anew instead.
+    """One row an episode, as text; what the file holds is kept unless ``overwrite`` begins anew.
 
     Raises:
         UserError: if the file can't be continued: it is of another kind, of other settings, or
-            of another agent or checkpoint.
+            of another agent or checkpoint than ``agents``, by the names of their run folders.
     """
 
     def __init__(
         self,
         path: Path,
         protocol: Protocol,
-        agents: Mapping[str, Mapping[str, Any]],
+        agents: Mapping[str, TrainedAgent],
         *,
         overwrite: bool,
     ) -> None:
@@ -79,85 +68,51 @@ class Table:
         if not set(rows) >= _COLUMNS:
             raise UserError(f"`{path}` is no table of this command, or of an earlier one: {_AGAIN}")
         for (run, point, _), part in rows.groupby(_KEY, sort=False):
-            wanted = {**agents.get(run, {}), "seed": protocol.seed}
+            wanted = _identity(agents[run]) if run in agents else {}
+            wanted |= {"seed": protocol.seed, "episodes": protocol.episodes}
             if part["removed_by"].iloc[0] == "random":
                 wanted["reduction_seed"] = protocol.reduction_seed
-            found = {name: ", ".join(sorted(set(part[name]))) for name in wanted if name in part}
-            found["episodes"] = str(len(part))
-            for name, value in _as_text(wanted | {"episodes": protocol.episodes}).items():
-                if found.get(name, "") != value:
+            part = part.assign(episodes=str(len(part)))
+            for name, value in wanted.items():
+                found = ", ".join(sorted(set(part[name]))) if name in part else ""
+                if found != str(value):
                     raise UserError(
-                        f"`{path}` holds {run} at {point} with {name} {found.get(name) or 'none'}, "
-                        f"and {value or 'none'} is asked for: {_AGAIN}"
+                        f"`{path}` holds {run} at {point} with {name} {found or 'none'}, and "
+                        f"{value} is asked for: {_AGAIN}"
                     )
         self.rows = rows
 
     def lacks(self, run: str, condition: Condition, modes: Sequence[str]) -> list[str]:
-        """Return the kinds of action, of those asked for, that a condition lacks.
-
-        Args:
-            run: name of its folder.
-            condition: the condition.
-            modes: kinds of action.
-        """
+        """Return the kinds of action, of those asked for, that a condition of a run lacks."""
         rows = self.rows[(self.rows["run"] == run) & (self.rows["point"] == condition.name)]
         return [mode for mode in modes if mode not in set(rows["mode"])]
 
-    def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Enter the episodes of a condition and write the table.
-
-        Args:
-            rows: of :func:`evaluate_condition`.
-        """
-        new = pd.DataFrame([_as_text(row) for row in rows])
+    def add(self, rows: Rows) -> None:
+        """Enter the episodes of a condition and write the table."""
+        new = pd.DataFrame(rows).astype(object).map(lambda v: "" if pd.isna(v) else str(v))
         self.rows = pd.concat([self.rows, new], ignore_index=True) if len(self.rows) else new
         self.write()
 
     def arrange(self, order: Sequence[tuple[str, str]]) -> None:
-        """Put conditions into an order, so that the table does not tell in which they came.
+        """Put runs and conditions into an order, whatever the one in which they came.
 
-        Args:
-            order: runs and conditions; others that the table holds come first, as they are. Of a
-                condition, sampled actions come before mean ones.
+        Others that the table holds come first, as they are. Of a condition, sampled actions come
+        before mean ones.
         """
-        keys = list(zip(self.rows["run"], self.rows["point"], strict=True))
-        first = {key: place for place, key in reversed(list(enumerate(keys)))}
-        ranks = {key: (rank, 0) for rank, key in enumerate(order)}
-        place = [
-            (*ranks.get(key, (-1, first[key])), mode != "sampled", row)
-            for row, (key, mode) in enumerate(zip(keys, self.rows["mode"], strict=True))
-        ]
-        self.rows = self.rows.iloc[[row for *_, row in sorted(place)]].reset_index(drop=True)
+        keys = self.rows["run"] + "\n" + self.rows["point"]
+        ranks = {f"{run}\n{point}": rank for rank, (run, point) in enumerate(order)}
+        rank, first = keys.map(ranks).fillna(-1), pd.factorize(keys)[0]
+        self.rows = self.rows.iloc[np.lexsort([self.rows["mode"] != "sampled", first, rank])]
 
     def write(self) -> None:
-        """Write the table whole, if there is anything to write."""
-        if len(self.rows):
-            write_whole(self.path, self.rows.fillna("").to_csv(index=False, lineterminator="\n"))
+        """Write the table whole."""
+        write_whole(self.path, self.rows.fillna("").to_csv(index=False, lineterminator="\n"))
 
 
-def _as_text(row: Mapping[str, Any]) -> dict[str, str]:
-    return {name: "" if value is None else str(value) for name, value in row.items()}
-
-
-def identity(trained: TrainedAgent) -> dict[str, Any]:
-    """Return the columns that tell agents apart, whatever their folders are called.
-
-    Args:
-        trained: the agent.
-
-    Returns:
-        Columns and values.
-    """
-    settings = trained.settings
-    return {
-        "env": env_name(settings),
-        "belief": settings.belief.get("name", ""),
-        "method": trained.method,
-        "training_seed": settings.seed,
-        "frames": trained.frames,
-        "trained_on": missingness_name(settings.missingness),
-        "trained_noise_sigma": settings.noise.sigma,
-    }
+def _identity(trained: TrainedAgent) -> dict[str, Any]:
+    """Return the columns that identify an agent; the noise of the condition has a column too."""
+    names = {"task": "env", "noise_sigma": "trained_noise_sigma"}
+    return {names.get(name, name): value for name, value in trained.columns().items()}
 
 
 def evaluate_condition(
@@ -167,25 +122,17 @@ def evaluate_condition(
     protocol: Protocol,
     *,
     run: str = "",
-) -> list[dict[str, Any]]:
-    """Evaluate an agent under a condition.
-
-    Args:
-        trained: the agent.
-        condition: what does not arrive or is wrong.
-        modes: kinds of action: ``sampled``, ``mean``.
-        protocol: how.
-        run: name of the agent's folder.
+) -> Rows:
+    """Evaluate an agent, of the run folder of a name, under a condition.
 
     Returns:
-        One row an episode and kind of action; None where a column says nothing.
+        One row an episode and kind of action (``modes``); None where a column does not apply.
     """
     episodes, policy = protocol.episodes, StoppingPolicy(trained.agent)
     removed = removed_sensors(
         condition, trained, episodes=episodes, reduction_seed=protocol.reduction_seed
     )
     make_env = trained.environments(condition.missingness, condition.noise, removed)
-    common = {"run": run, **identity(trained), **condition.columns()}
     at_random = condition.selection == "random"
     rows = []
     for mode in modes:
@@ -193,7 +140,9 @@ def evaluate_condition(
         assert result is not None
         likelihoods: Sequence[float | None] = result.log_likelihoods or [None] * episodes
         rows += [
-            common
+            {"run": run}
+            | _identity(trained)
+            | condition.columns()
             | {
                 "mode": mode,
                 "episode": episode,
@@ -210,61 +159,17 @@ def evaluate_condition(
     return rows
 
 
-# Several at a time ----------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=1)
-def _agent(folder: Path, gate: float | None) -> TrainedAgent:
-    """Return a run's agent; the conditions of a run come one after the other and share it."""
-    return load_trained_agent(folder, gate)
-
-
-def _evaluate_task(task: Task, protocol: Protocol) -> list[dict[str, Any]]:
+def _evaluate_task(task: Task, protocol: Protocol) -> tuple[Task, Rows]:
     torch.set_num_threads(protocol.threads)
     folder, condition, modes = task
-    trained = _agent(folder, protocol.gate)
-    return evaluate_condition(trained, condition, modes, protocol, run=folder.name)
+    trained = load_trained_agent(folder, protocol.gate)
+    return task, evaluate_condition(trained, condition, modes, protocol, run=folder.name)
 
 
 def evaluate_tasks(
     tasks: Sequence[Task], protocol: Protocol, processes: int
-) -> Iterator[tuple[Task, list[dict[str, Any]]]]:
-    """Evaluate conditions of runs, several at a time; the numbers do not depend on how many.
-
-    Args:
-        tasks: run folders, conditions and kinds of action.
-        protocol: how.
-        processes: at a time; 1: in this process.
-
-    Yields:
-        Task and rows, as they come.
-    """
-    if min(processes, len(tasks)) <= 1:
-        _agent.cache_clear()  # the folder may have got another checkpoint since
-        for task in tasks:
-            yield task, _evaluate_task(task, protocol)
-        return
-    # A fresh interpreter each: a fork would inherit torch's threads and half-held locks.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        min(processes, len(tasks)), context, initializer=_end_with_parent
-    ) as pool:
-        futures = {pool.submit(_evaluate_task, task, protocol): task for task in tasks}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent is gone, even one that was killed."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-
-        def watch() -> None:
-            wait([parent.sentinel])
-            os._exit(1)
-
-        threading.Thread(target=watch, daemon=True).start()
+) -> Iterator[tuple[Task, Rows]]:
+    """Yield tasks and their rows as they come, several at a time; the numbers are the same."""
+    jobs = (delayed(_evaluate_task)(task, protocol) for task in tasks)
+    count = max(1, min(processes, len(tasks)))
+    yield from Parallel(count, return_as="generator_unordered", batch_size=1)(jobs)

@@ -6,42 +6,50 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import torch
 from omegaconf import DictConfig
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from training.agent import Agent, load_agent, make_agent
+from training.agent import Agent, add_primers, load_agent, make_agent
 from training.checkpoint import fitting
-from training.envs import make_env
+from training.config import missingness_name
+from training.envs import env_name, make_env
 from training.errors import UserError
 from training.methods import method_name
 from training.run_folder import load_config
 from training.sensors import sensor_names
 
-from evaluation.episodes import BLOCK, make_evaluation_environment
-from torchrl_drbpn import BeliefFilterModule
+from evaluation.episodes import BLOCK
+from torchrl_drbpn import BeliefFilterModule, SensorReduction
 
 WEIGHTS = "agent.safetensors"  # of an agent that was saved by itself
 
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """The last checkpoint of a run, ready to act.
+    """An agent, ready to act.
 
     Attributes:
         settings: configuration of the run.
         agent: with the trained weights.
-        frames: environment steps of the checkpoint.
-        method: what it is called in tables and figures.
+        frames: environment steps that it was trained for.
+        gate: see :func:`load_trained_agent`.
     """
 
     settings: DictConfig
     agent: Agent
     frames: int
-    method: str
+    gate: float | None = None
+
+    @property
+    def method(self) -> str:
+        """Return what it is called in tables and figures."""
+        return method_name(self.settings) + (f", gate {self.gate:g}" if self.gate else "")
 
     @property
     def obs_dim(self) -> int:
@@ -59,6 +67,19 @@ class TrainedAgent:
         make, agent = self.agent.observing, self.agent
         return TensorDictSequential(agent.norm, make() if make else agent.belief, agent.actor)
 
+    def columns(self) -> dict[str, Any]:
+        """Return the columns of a table that identify the agent, whatever its folder is called."""
+        settings = self.settings
+        return {
+            "task": env_name(settings),
+            "belief": settings.belief.get("name", ""),
+            "method": self.method,
+            "training_seed": settings.seed,
+            "frames": self.frames,
+            "trained_on": missingness_name(settings.missingness),
+            "noise_sigma": settings.noise.sigma,
+        }
+
     def environments(
         self,
         missingness: DictConfig | None = None,
@@ -67,32 +88,33 @@ class TrainedAgent:
         *,
         complete: bool = False,
     ) -> Callable[[int], TransformedEnv]:
-        """Return what builds the environment of each block of episodes.
+        """Return what builds the environment of a block of episodes, like the training ones.
 
         Args:
             missingness: what does not arrive; None: as in training.
             noise: what is added to what arrives; None: as in training.
             removed: components that never arrive, bool of shape ``(episodes, obs)``; None: none.
             complete: whether to write ``complete_observation``, normalised alike.
-
-        Returns:
-            A function of the block's number, see :func:`evaluation.episodes.run_episodes`.
         """
+        changed = self.settings.copy()
+        changed.missingness = missingness or changed.missingness
+        changed.noise = noise or changed.noise
 
         def make(block: int) -> TransformedEnv:
-            gone = None
+            replaced = {}
             if removed is not None:
-                gone = removed.new_zeros(BLOCK, self.obs_dim)
                 own = removed[block * BLOCK : (block + 1) * BLOCK]
-                gone[: len(own)] = own
-            return make_evaluation_environment(
-                self.settings,
-                self.agent,
-                missingness=missingness,
-                noise=noise,
+                rest = removed.new_zeros(BLOCK - len(own), self.obs_dim)
+                replaced["reduction"] = SensorReduction(torch.cat([own, rest]))
+            env = make_env(
+                changed,
+                num_envs=BLOCK,
+                seed=changed.evaluation.seed,
                 complete=complete,
-                removed=gone,
+                transforms=replaced,
             )
+            add_primers(env, self.agent)
+            return env
 
         return make
 
@@ -103,10 +125,7 @@ def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
     Args:
         folder: the run folder, or one of ``recipes/save_agent.py``.
         gate: standard deviations of the innovation, beyond which a reading counts as if at that
-            distance; None: every reading is believed. The agent's method names it.
-
-    Returns:
-        The agent and what it was trained with.
+            distance; None: every reading is believed.
 
     Raises:
         UserError: if the folder or the checkpoint can't be used, or the gate is refused.
@@ -118,17 +137,23 @@ def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
             frames = _load_weights(weights, agent)
         else:
             agent, frames = load_agent(folder, config, env)
-    trained = TrainedAgent(config, agent, frames, method_name(config))
-    return trained if gate is None else _gated(trained, gate)
+    trained = TrainedAgent(config, agent, frames)
+    if gate is None:
+        return trained
+    if not isinstance(agent.belief, BeliefFilterModule):
+        raise UserError(
+            f"`gate` must be null for belief={config.belief.name}, got {gate!r}: "
+            "only belief=drbpn has a forecast of its readings to compare them with."
+        )
+    try:
+        agent.belief.gate = gate
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return replace(trained, gate=gate)
 
 
 def save_weights(folder: Path, trained: TrainedAgent) -> None:
-    """Write the weights of an agent whole, the statistics of its normalisation among them.
-
-    Args:
-        folder: an existing folder.
-        trained: the agent.
-    """
+    """Write the weights of an agent whole, the statistics of its normalisation among them."""
     tensors = {name: value.contiguous() for name, value in trained.agent.state_dict().items()}
     temporary = folder / f".{WEIGHTS}.tmp"
     save_file(tensors, temporary, metadata={"frames": str(trained.frames)})
@@ -146,17 +171,3 @@ def _load_weights(path: Path, agent: Agent) -> int:
     with fitting(str(path)):
         agent.load_state_dict(weights)
     return frames
-
-
-def _gated(trained: TrainedAgent, gate: float) -> TrainedAgent:
-    module = trained.agent.belief
-    if not isinstance(module, BeliefFilterModule):
-        raise UserError(
-            f"`gate` must be null for belief={trained.settings.belief.name}, got {gate!r}: "
-            "only belief=drbpn has a forecast of its readings to hold them against."
-        )
-    try:
-        module.gate = gate
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    return replace(trained, method=f"{trained.method}, gate {gate:g}")

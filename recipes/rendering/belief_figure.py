@@ -3,43 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from PIL import Image
 from training.errors import UserError
 
+from rendering.style import STYLE
 from rendering.trajectory import INTERVAL_95, Recording
 
 TRUTH, ARRIVED, BELIEF, MISSING = "#222222", "#111111", "#1f77c4", "#f8ddd2"
 ABSENT = "#e3997f"  # an entry of a mask that did not arrive
 _DASHES: Any = (0, (3, 1.5))
 _WIDTH_INCHES, _PANEL_INCHES, _STRIP_INCHES, _MASK_INCHES = 10.0, 1.05, 1.55, 0.75
-STYLE: Any = {
-    "font.size": 9.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-}
 
 
 def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]) -> list[int]:
-    """Return the sensors to draw.
+    """Return the indices of the sensors to draw.
 
-    Args:
-        recording: of an episode.
-        wanted: how many of those that miss most, or names or numbers of components.
-
-    Returns:
-        Indices of components.
+    ``wanted`` is how many of those that miss most, or names or numbers of components.
 
     Raises:
         UserError: if there is no such sensor.
@@ -64,17 +48,7 @@ def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]
 def draw_belief(
     recording: Recording, sensors: Sequence[int], *, pictures: int, title: str
 ) -> Figure:
-    """Draw a strip of pictures, the mask of all sensors, and a panel a sensor.
-
-    Args:
-        recording: of an episode.
-        sensors: indices of the sensors drawn.
-        pictures: how many of the robot, at most.
-        title: above everything.
-
-    Returns:
-        The figure.
-    """
+    """Draw a strip of at most so many pictures, the mask of all sensors, and a panel a sensor."""
     shown = min(pictures, len(recording.pictures))
     heights = [_STRIP_INCHES] * bool(shown) + [_MASK_INCHES, *[_PANEL_INCHES] * len(sensors)]
     with mpl.rc_context(STYLE):
@@ -96,10 +70,7 @@ def draw_belief(
 def draw_panels(axes: Sequence[Any], recording: Recording, sensors: Sequence[int]) -> None:
     """Draw the mask of all sensors and, of some, truth, arrivals, gaps and belief over the steps.
 
-    Args:
-        axes: one for the mask, then one a sensor; they share the steps.
-        recording: of an episode.
-        sensors: indices of the sensors drawn.
+    The first of the axes is for the mask, then comes one a sensor; they share the steps.
     """
     count, steps = len(recording.names), recording.steps
     edges = (steps[0] - 0.5, steps[-1] + 0.5)
@@ -141,47 +112,21 @@ def draw_panels(axes: Sequence[Any], recording: Recording, sensors: Sequence[int
 
 
 def legend_of(recording: Recording) -> list[Any]:
-    """Return what explains the panels of a recording.
-
-    Args:
-        recording: whose belief may tell nothing, or have no interval.
-    """
+    """Return what explains the panels of a recording."""
     line = mpl.lines.Line2D
     handles: list[Any] = [
         line([], [], color=TRUTH, lw=0.9, ls=_DASHES, label="true value, unknown to the agent"),
         line([], [], color=ARRIVED, marker=".", ls="", ms=7, mew=0, label="what arrived"),
         Patch(color=MISSING, label="nothing arrived"),
     ]
-    name = "belief" if recording.told == "estimate" else "forecast"
-    if recording.told != "nothing" and np.isnan(recording.std).all():
+    name = "belief" if recording.kind == "estimate" else "forecast"
+    if recording.kind != "nothing" and np.isnan(recording.std).all():
         handles.append(line([], [], color=BELIEF, lw=2.2, label=name))
-    elif recording.told != "nothing":
+    elif recording.kind != "nothing":
         light = (*mpl.colors.to_rgb(BELIEF), 0.3)
         label = f"{name} and its 95 % interval"
         handles.append(Patch(facecolor=light, edgecolor=BELIEF, label=label))
     return handles
-
-
-def save_figure(figure: Figure, path: Path, *, dpi: int, palette: bool = False) -> None:
-    """Write a figure whole or not at all.
-
-    Args:
-        figure: the figure.
-        path: the PNG file.
-        dpi: dots per inch.
-        palette: whether 256 colours are enough: a third of the size.
-    """
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        # No date and no version: the same figure gives the same bytes.
-        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
-        if palette:
-            with Image.open(temporary) as picture:
-                few = picture.convert("RGB").quantize(256, kmeans=1)
-            few.save(temporary, format="png", optimize=True)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _draw_strip(axis: Any, recording: Recording, count: int) -> None:

@@ -25,8 +25,8 @@ from training.errors import UserError
 from torchrl_drbpn.functional import zero_missing
 
 INTERVAL_95 = 1.959964  # half width of a normal's central 95 %, in standard deviations
-# What a belief tells of the sensors: their values after looking, the readings before, or nothing.
-Told = Literal["estimate", "forecast", "nothing"]
+# Of a belief: the sensors' values after the observation, the readings before it, or nothing.
+Kind = Literal["estimate", "forecast", "nothing"]
 Picture = NDArray[np.uint8]
 _FAR = 0.9999  # depth of what is not there, 1 at the far end of the scene
 
@@ -36,30 +36,30 @@ class Recording:
     """Part of an episode, step by step; sensor values in normalised units, ``(time, obs)`` each.
 
     Attributes:
+        kind: what ``estimate`` is: the sensor's value by what arrived until this step, the reading
+            predicted from the step before, or nothing.
         task: Gymnasium id.
         names: of the sensor components.
         first_step: of the episode that is in here.
+        pictures: of the robot at each step; empty where it can't be drawn.
         complete: what complete, noiseless sensors would have shown.
         arrived: what arrived, 0 where nothing did.
         observed: bool, True where something arrived.
-        estimate: what the belief says of every sensor; NaN where it says nothing.
+        estimate: of every sensor by the belief; NaN where it has none.
         std: its standard deviation, of the belief filter the root of the diagonal of H P H'; NaN
             where the belief has none.
-        told: what ``estimate`` is: the sensor's value by what arrived until this step, the reading
-            predicted from the step before, or nothing.
-        pictures: of the robot at each step; empty where it can't be drawn.
     """
 
+    kind: Kind
     task: str
     names: list[str]
     first_step: int
+    pictures: list[Picture]
     complete: NDArray[np.float64]
     arrived: NDArray[np.float64]
     observed: NDArray[np.bool_]
     estimate: NDArray[np.float64]
     std: NDArray[np.float64]
-    told: Told
-    pictures: list[Picture]
 
     @property
     def steps(self) -> NDArray[np.int64]:
@@ -101,10 +101,7 @@ class Camera:
         self.twin: Any = made.unwrapped
 
     def picture(self, simulator: Any) -> Picture:
-        """Return a picture ``(height, width, 3)``.
-
-        Args:
-            simulator: an unwrapped environment of the same task.
+        """Return a picture ``(height, width, 3)`` of an unwrapped environment of the same task.
 
         Raises:
             RuntimeError: if its state can't be set, or nothing is drawn on this machine.
@@ -135,7 +132,8 @@ def record_episode(
 ) -> Recording:
     """Let a trained agent act and record what it saw, missed and believed.
 
-    The episode is the first of an evaluation with the same seed.
+    The episode is the first of an evaluation with the same seed. If nothing can be drawn, a printed
+    line says why.
 
     Args:
         trained: the agent.
@@ -147,24 +145,21 @@ def record_episode(
         steps: steps to keep; fewer where the episode ends before.
         picture_size: width and height of the robot's pictures, pixels; None: no pictures.
 
-    Returns:
-        The recording. If nothing can be drawn, a printed line says why.
-
     Raises:
         UserError: if the episode is over before ``start``.
     """
     # States are read from Gymnasium's simulators, whatever the agent was trained on.
     local = trained.settings.copy()
     local.env.backend = "gymnasium"
+    task, env = env_name(local), None
     make = replace(trained, settings=local).environments(
         condition.missingness, condition.noise, removed, complete=True
     )
-    camera = _camera(env_name(local), picture_size) if picture_size else None
-    env: Any = None
+    camera: Camera | None = None
     rows: list[tuple[Tensor, ...]] = []
     pictures: list[Picture] = []
+    kind: Kind = "nothing"
     done = 0
-    told: Told = "nothing"
 
     def make_env(block: int) -> TransformedEnv:
         nonlocal env
@@ -172,20 +167,22 @@ def record_episode(
         return env
 
     def policy(data: TensorDictBase) -> TensorDictBase:
-        nonlocal camera
-        if camera is not None and done >= start:
+        nonlocal camera, picture_size
+        if picture_size and env is not None and done >= start:
             try:
+                camera = camera or Camera(task, picture_size)
                 pictures.append(camera.picture(env.base_env.envs[0].unwrapped))
             except Exception as error:  # each OpenGL back end fails in its own way
-                _say_no_pictures(error)
-                camera = None
+                reason = " ".join(str(error).split())[:200] or type(error).__name__
+                say(f"no pictures of the robot, off-screen rendering failed: {reason}")
+                picture_size = None
         return observing(data)
 
     def watch(_: slice, data: TensorDictBase, __: Tensor) -> None:
-        nonlocal done, told
+        nonlocal done, kind
         if done >= start:
-            rows.append(_sensors(data[0]))
-            told = _told(data)
+            kind, row = _sensors(data[0])
+            rows.append(row)
         done += 1
 
     observing = trained.observing_policy
@@ -195,56 +192,25 @@ def record_episode(
     )  # fmt: skip
     if not rows:
         raise UserError(f"`start` must lie inside the episode, which ended after {done} steps.")
-    complete, arrived, observed, estimate, std = (
-        torch.stack(column).numpy() for column in zip(*rows, strict=True)
-    )
-    return Recording(
-        env_name(local),
-        trained.sensors,
-        start,
-        complete,
-        arrived,
-        observed,
-        estimate,
-        std,
-        told,
-        pictures if len(pictures) == len(rows) else [],
-    )
+    columns: Any = (torch.stack(column).numpy() for column in zip(*rows, strict=True))
+    whole = pictures if len(pictures) == len(rows) else []
+    return Recording(kind, task, trained.sensors, start, whole, *columns)
 
 
-def _camera(env_id: str, size: tuple[int, int]) -> Camera | None:
-    try:
-        return Camera(env_id, size)
-    except Exception as error:
-        _say_no_pictures(error)
-        return None
-
-
-def _say_no_pictures(error: Exception) -> None:
-    reason = " ".join(str(error).split())[:200] or type(error).__name__
-    say(f"no pictures of the robot, off-screen rendering failed: {reason}")
-
-
-def _told(data: TensorDictBase) -> Told:
-    """Return what the belief has written of the sensors; what it says after looking goes first."""
-    keys = data.keys(include_nested=True)
-    if ESTIMATE in keys:
-        return "estimate"
-    return "forecast" if FORECAST in keys else "nothing"
-
-
-def _sensors(data: TensorDictBase) -> tuple[Tensor, ...]:
-    """Return complete, arrived, observed, estimate and its deviation, shape (obs,) each."""
+def _sensors(data: TensorDictBase) -> tuple[Kind, tuple[Tensor, ...]]:
+    """Return the kind of the belief's estimate, and the arrays of a recording, ``(obs,)`` each."""
     complete, observed = data["normalized_complete_observation"].double(), data["observed"].clone()
     unknown = torch.full_like(complete, torch.nan)
+    kind: Kind = "estimate"
     estimate, variance = data.get(ESTIMATE, None), data.get(ESTIMATE_VARIANCE, None)
     if estimate is None:
-        estimate, cov = data.get(FORECAST, unknown), data.get(FORECAST_COV, None)
+        estimate, cov = data.get(FORECAST, None), data.get(FORECAST_COV, None)
+        kind = "nothing" if estimate is None else "forecast"
         variance = None if cov is None else cov.diagonal()
-    return (
+    return kind, (
         complete,
         zero_missing(data["normalized_observation"], observed).double(),
         observed,
-        estimate.double(),
+        unknown if estimate is None else estimate.double(),
         unknown if variance is None else variance.double().clamp_min(0).sqrt(),
     )

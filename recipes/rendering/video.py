@@ -8,7 +8,6 @@ logger, none of which writes a GIF or takes a file's name; imageio does both.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,13 +19,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-from training.errors import UserError
 
-from rendering.belief_figure import STYLE, draw_panels, legend_of
+from rendering.belief_figure import draw_panels, legend_of
+from rendering.style import STYLE
 from rendering.trajectory import Picture, Recording
 
 _PALETTE_FRAMES = 8  # from as many frames the colours of a GIF are taken
-FASTEST = 50  # frames a second; a GIF counts in hundredths of a second
 _INCHES = (6.4, 4.0)
 _ROBOT = (0.0, 0.12, 0.36, 0.8)  # left, bottom, width and height, in parts of the film
 _SMALL: dict[str, Any] = {
@@ -39,20 +37,12 @@ _SMALL: dict[str, Any] = {
 
 
 def film_size(width: int) -> tuple[int, int]:
-    """Return width and height of a film, both even: video codecs take no others.
-
-    Args:
-        width: pixels.
-    """
+    """Return width and height of a film, pixels, both even: video codecs take no others."""
     return 2 * (width // 2), 2 * round(width * _INCHES[1] / _INCHES[0] / 2)
 
 
 def robot_size(width: int) -> tuple[int, int]:
-    """Return width and height of the robot's pictures in a film.
-
-    Args:
-        width: of the film, pixels.
-    """
+    """Return width and height of the robot's pictures in a film of a width, pixels."""
     across, upward = film_size(width)
     return round(_ROBOT[2] * across), round(_ROBOT[3] * upward)
 
@@ -129,34 +119,8 @@ class Film(Sequence[Picture]):
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
 
-def check_video(path: Path, fps: float) -> None:
-    """Refuse a film that could not be written, before any work is done for it.
-
-    Args:
-        path: where it is to be; a name that ends in .gif or .mp4.
-        fps: frames a second.
-
-    Raises:
-        UserError: if the writer is not installed, or ``fps`` out of range.
-    """
-    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise UserError(
-            "`out` as .mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or take "
-            f"{path.with_suffix('.gif').name}."
-        )
-    if not 1 <= fps <= FASTEST:
-        raise UserError(f"`fps` must be in [1, {FASTEST}], got {fps}.")
-
-
 def write_video(path: Path, frames: Sequence[Picture], *, fps: float, colours: int) -> None:
-    """Write a film whole or not at all; its suffix says which.
-
-    Args:
-        path: the GIF or MP4 file.
-        frames: pictures ``(height, width, 3)``.
-        fps: frames a second, of a GIF to the next hundredth of a second a frame.
-        colours: of a GIF; fewer make a smaller file.
-    """
+    """Write a GIF or MP4 whole or not at all, by the suffix; fewer colours make a smaller GIF."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         if path.suffix == ".mp4":

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -22,13 +22,10 @@ from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_drbpn import BeliefDivergedError
 from training.errors import UserError
 
 CONF = Path(__file__).parents[2] / "conf"
 GROUPINGS = ("sensor", "joint", "kind")
-# What ends in one line. A belief diverges where an agent's learned model runs open loop.
-EXPECTED = (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException)
 _USER_ERROR = 2
 
 # Least and greatest value of what no constructor checks.
@@ -315,42 +312,69 @@ OmegaConf.register_new_resolver("run_folder", _run_folder, use_cache=True, repla
 # The command line -----------------------------------------------------------------------------
 
 
-def run_command(main: Callable[[], None]) -> None:
+def run_command(main: Callable[[], None], name: str = "config") -> None:
     """Run a command of recipes/; leave with status 2 and one line where the user can mend it.
 
     Args:
         main: decorated by ``hydra.main``.
+        name: of its file in conf/.
     """
     # Hydra hands errors on instead of printing them; where the user wants tracebacks, we do too.
     wanted = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
     if wanted:
         main()
-    elif status := explained(main):
+    elif status := explained(main, name):
         sys.exit(status)
 
 
-def explained(job: Callable[[], int | None]) -> int:
+def command(name: str, run: Callable[[dict[str, Any]], int]) -> None:
+    """Run a recipe on what Hydra composes from a file of conf/, as plain containers.
+
+    Args:
+        name: of the file.
+        run: the recipe; returns an exit status.
+    """
+
+    @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
+    def main(config: DictConfig) -> None:
+        plain = OmegaConf.to_container(config, resolve=True)
+        if status := run(cast(dict[str, Any], plain)):
+            sys.exit(status)
+
+    run_command(main, name)
+
+
+def expected() -> tuple[type[Exception], ...]:
+    """Return the errors that end in one line; reports, which need none, do without torch."""
+    from torchrl_drbpn import BeliefDivergedError  # where a learned model runs open loop
+
+    return (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException)
+
+
+def explained(job: Callable[[], int | None], name: str = "config") -> int:
     """Run a job; turn what the user can mend into one line on standard error.
 
     Args:
         job: returns an exit status, or None for 0.
+        name: of its file in conf/.
 
     Returns:
         The job's status, or 2 for an error of the user's.
     """
     try:
         return job() or 0
-    except EXPECTED as error:
-        sys.stderr.write(f"error: {explain(error)}\n")
+    except expected() as error:
+        sys.stderr.write(f"error: {explain(error, name)}\n")
         return _USER_ERROR
 
 
-def explain(error: BaseException) -> str:
+def explain(error: BaseException, file: str = "config") -> str:
     """Turn an error into one line; an unknown name gets the nearest one that there is.
 
     Args:
         error: of Hydra, or our own.
+        file: of conf/, whose names there are.
 
     Returns:
         The line.
@@ -360,7 +384,7 @@ def explain(error: BaseException) -> str:
         r"Could not (?:override|append to config\. An item is .*?|delete.*?) ?'([^']+)'", text
     ):
         name = found[1]
-        return f"`{name}` is no setting: {_nearest(name, _names())}"
+        return f"`{name}` is no setting: {_nearest(name, _names(file))}"
     if found := re.search(r"Could not find '([^']+)'", text):
         group, _, name = found[1].rpartition("/")
         options = re.findall(r"^\t(\S+)$", text, re.MULTILINE)
@@ -388,13 +412,14 @@ def _nearest(name: str, names: Sequence[str]) -> str:
     return f"did you mean `{found[0]}`?" if found else f"there are {', '.join(sorted(names))}."
 
 
-def _names() -> list[str]:
-    """Return every group and every dotted key of the training configuration."""
+def _names(file: str) -> list[str]:
+    """Return every dotted key of a configuration, of the training's every group too."""
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        keys = [key for key, _ in _leaves(hydra.compose("config"))]
+        keys = [key for key, _ in _leaves(hydra.compose(file))]
     parents = {key[:i] for key in keys for i in range(len(key)) if key[i] == "."}
-    return sorted({*keys, *parents, *(path.name for path in CONF.iterdir() if path.is_dir())})
+    groups = [path.name for path in CONF.iterdir() if path.is_dir() and file == "config"]
+    return sorted({*keys, *parents, *groups})
 
 
 def command_line() -> list[str]:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Self
 
-from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 # Environment variable: a file whose presence asks every cell of a sweep to stop.
@@ -29,18 +28,6 @@ def say(text: str) -> None:
     except BrokenPipeError:
         # What is written later, and at the end of the process, goes nowhere too.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def start(run: Callable[[dict[str, Any]], int], config: DictConfig) -> None:
-    """Run what a command composed; leave with its status where it is not 0.
-
-    Args:
-        run: the command, on a plain configuration.
-        config: what Hydra composed.
-    """
-    status = run(cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)))
-    if status:
-        sys.exit(status)
 
 
 def show(bar: tqdm[Any], row: Mapping[str, Any]) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from evaluation.episodes import Episodes, evaluate, make_evaluation_environment
+from evaluation.episodes import Episodes, evaluate
+from evaluation.trained import TrainedAgent
 from omegaconf import DictConfig
-from torchrl.envs import TransformedEnv
 
 from training.state import Training
 
@@ -32,10 +32,7 @@ def evaluate_training(
         A row for each kind of action, see :data:`training.run_folder.EVALUATION_COLUMNS`; None
         where it was given up.
     """
-
-    def make_env(_: int) -> TransformedEnv:
-        return make_evaluation_environment(config, training.agent)
-
+    make_env = TrainedAgent(config, training.agent, training.frames).environments()
     rows = []
     for mode in config.evaluation.modes:
         result = evaluate(

@@ -13,15 +13,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from torchrl.record.loggers.common import Logger
 from yaml import YAMLError
 
 from training.config import build
 from training.errors import UserError
+
+if TYPE_CHECKING:  # reports read run folders without loading torch
+    from torchrl.record.loggers.common import Logger
 
 _PACKAGES = (
     *("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "envpool", "numpy", "hydra-core"),

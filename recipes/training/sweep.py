@@ -20,7 +20,7 @@ from hydra.core.utils import JobReturn
 from omegaconf import DictConfig, OmegaConf
 
 from training.checkpoint import checkpoint_frames
-from training.config import EXPECTED, explain, one_line
+from training.config import expected, explain, one_line
 from training.console import STOP_FILE, StopRequest, say
 from training.errors import UserError
 from training.run_folder import MAY_CHANGE, is_evaluated, load_config, locked
@@ -48,7 +48,7 @@ def run_cell(job: Callable[[], int], folder: Path) -> tuple[str, str]:
             return folder.name, STOPPED
         try:
             status = job()
-        except EXPECTED as error:
+        except expected() as error:
             line = explain(error)
         except Exception as error:  # a fault of ours, or of a library
             traceback.print_exc()
@@ -143,7 +143,7 @@ def run_sweep(
     with StopRequest(file) as stop, _environment(file, apart=apart):
         try:
             batches = sweep()
-        except EXPECTED:
+        except expected():
             raise
         except Exception as error:  # of a launcher: a process of it was ended from outside
             raise UserError(
