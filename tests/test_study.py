@@ -8,6 +8,7 @@ whatever runs the cells: one after another, joblib, submitit.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
@@ -30,19 +31,22 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.cell_sweeper import CellSweeper
 from omegaconf import DictConfig, OmegaConf
+from ppo_drbpn import train
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.console import STOP_FILE, StopRequest
 from training.errors import UserError
-from training.run_folder import write_config
 from training.sweep import continued, run_cell
 
 STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 OVERLAYS = ("experiment", "study", "method")
-BRIEF = ("experiment=smoke", "total_frames=256", "evaluation.every_frames=0")
-# Long enough to be caught while it runs; it saves only at its end.
-LONG = (*BRIEF[::2], "total_frames=1_000_000", "optim.epochs=1")
+BRIEF = ("experiment=smoke", "total_frames=200", "evaluation.every_frames=0")
+# Long enough to be caught while it runs; it saves when it is stopped.
+LONG = (
+    *("evaluation.every_frames=0", "checkpoint.every_frames=10_000_000", "optim.epochs=1"),
+    *("total_frames=1_000_000", "hydra.sweep.dir=out"),
+)
 
 
 # What stands in conf --------------------------------------------------------------------------
@@ -124,8 +128,10 @@ def test_the_command_line_wins_over_a_study_and_a_method() -> None:
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 200 steps, rounded up to two rollouts of 128."""
     folder = tmp_path_factory.mktemp("sweep") / "cell"
     assert run(folder, *BRIEF) == 0
+    assert checkpoint_frames(folder) == 256
     return folder
 
 
@@ -138,34 +144,16 @@ def test_a_cell_that_is_done_is_left_as_it_is(
     assert {path: path.stat().st_mtime_ns for path in done.rglob("*") if path.suffix} == before
 
 
-@pytest.mark.parametrize("lacking", ["steps", "more steps are wanted", "final evaluation"])
-def test_a_cell_that_was_cut_off_goes_on(done: Path, tmp_path: Path, lacking: str) -> None:
+@pytest.mark.parametrize("total", [200, 512], ids=["in its final evaluation", "before its end"])
+def test_a_cell_that_was_cut_off_goes_on_to_its_end(done: Path, tmp_path: Path, total: int) -> None:
     folder = shutil.copytree(done, tmp_path / "cell")
-    words = list(BRIEF)
-    if lacking == "steps":
-        words[1] = "total_frames=512"
-        write_config(folder, make_config(*words))
-    elif lacking == "more steps are wanted":
-        words[1] = "total_frames=384"
-    else:
-        (folder / "evaluation.csv").unlink()
-    config = continued(make_config(*words), folder)
+    (folder / "evaluation.csv").unlink()
+    config = continued(make_config(*BRIEF, f"total_frames={total}"), folder)
     assert config is not None
     assert config.resume == str(folder)
-
-
-def test_a_cell_that_rounds_its_steps_up_to_a_rollout_is_done_at_its_end(tmp_path: Path) -> None:
-    words = (BRIEF[0], "total_frames=200", BRIEF[2])
-    assert run(tmp_path / "cell", *words) == 0
-    assert checkpoint_frames(tmp_path / "cell") == 256
-    assert continued(make_config(*words), tmp_path / "cell") is None
-    (tmp_path / "cell" / "evaluation.csv").unlink()  # killed in its final evaluation
-    config = continued(make_config(*words), tmp_path / "cell")
-    from ppo_drbpn import train
-
-    assert config is not None
-    assert train(config, tmp_path / "cell") == 0
-    assert len(read_table(tmp_path / "cell" / "evaluation.csv")) == 2
+    assert train(config, folder) == 0
+    assert checkpoint_frames(folder) == max(256, total)
+    assert len(read_table(folder / "evaluation.csv")) == 2
 
 
 def test_a_cell_that_was_killed_before_its_first_checkpoint_starts_anew(
@@ -185,18 +173,15 @@ def test_a_cell_that_was_killed_before_its_first_checkpoint_starts_anew(
 def test_another_configuration_in_the_folder_of_a_cell_is_refused(done: Path) -> None:
     with pytest.raises(UserError, match=r"other settings \(seed, optim.lr\): name another folder"):
         continued(make_config(*BRIEF, "seed=1", "optim.lr=0.1"), done)
-    with pytest.raises(UserError, match="`resume` continues one run"):
-        continued(make_config(*BRIEF, "resume=x"), done)
 
 
 def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken() -> int:
         raise RuntimeError("two\nlines")
 
     assert run_cell(broken, tmp_path / "cell") == ("cell", "RuntimeError: two lines")
-    assert "cell: error: RuntimeError: two lines\n" in capsys.readouterr().err
     assert run_cell(lambda: 0, tmp_path / "cell") == ("cell", "")
     monkeypatch.setenv(STOP_FILE, str(tmp_path / "stop"))
     with StopRequest(tmp_path / "stop"):
@@ -207,114 +192,85 @@ def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_othe
 # Sweeps ---------------------------------------------------------------------------------------
 
 
-def same_run(first: Path, second: Path) -> bool:
-    states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
-    return not differences(*states) and all(
-        read_table(first / table) == read_table(second / table)
-        for table in ("metrics.csv", "evaluation.csv")
+def sweep(folder: Path, rates: str, launcher: str = "basic") -> subprocess.CompletedProcess[str]:
+    words = (
+        f"optim.lr={rates}",
+        "belief=none",
+        "hydra.sweep.dir=out",
+        f"hydra/launcher={launcher}",
     )
-
-
-@pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three cells one after another: one that diverges, one that is refused, one that is well."""
-    folder = tmp_path_factory.mktemp("swept")
-    words = ("optim.lr=1e30,-1,1e-3", "hydra.sweep.dir=out", "belief=none")
-    answer = command("ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=folder)
-    (folder / "answer").write_text(answer.stdout)
-    assert answer.returncode == 1, answer.stderr
-    return folder
-
-
-def out(folder: Path, rate: str) -> Path:
-    (found,) = (folder / "out").glob(f"*lr-{rate}*")
-    return found
+    return command("ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=folder)
 
 
 @pytest.mark.slow
-def test_a_cell_that_fails_or_is_refused_ends_no_other_and_is_listed(swept: Path) -> None:
-    said = (swept / "answer").read_text()
-    assert "1 of 3 cells are done: out\n" in said
-    failed = re.findall(r"^failed: \S+: (.*)$", said, re.MULTILINE)
-    assert len(failed) == 2
-    assert failed[0].startswith("training stopped at ")
-    assert "lr" in failed[1].lower()
-    assert checkpoint_frames(out(swept, "0.001")) == 256
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_launchers_run_the_same_cells_to_the_same_bit(
-    swept: Path, tmp_path: Path, launcher: str
+def test_what_fails_ends_no_other_and_launchers_run_the_same_cells_to_the_same_bit(
+    tmp_path: Path,
 ) -> None:
-    pytest.importorskip(launcher.split("_")[0])
-    words = ("optim.lr=1e-3,-1", "hydra.sweep.dir=out", "belief=none", f"hydra/launcher={launcher}")
-    answer = command("ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=tmp_path)
-    assert answer.returncode == 1, answer.stderr
-    assert "1 of 2 cells are done: out\n" in answer.stdout
-    assert same_run(out(swept, "0.001"), out(tmp_path, "0.001"))
-    if launcher == "joblib":
-        assert "Done   2 out of   2" in answer.stderr
+    """One cell diverges, one is refused, one is well; one after another, then by each launcher."""
+    made = {}
+    for launcher in ("basic", "joblib", "submitit_local"):
+        (tmp_path / launcher).mkdir()
+        answer = sweep(tmp_path / launcher, "1e30,-1,1e-3", launcher)
+        assert answer.returncode == 1, answer.stderr
+        assert "\n1 of 3 cells are done: out\n" in "\n" + answer.stdout
+        failed = re.findall(r"^failed: \S+: (.*)$", answer.stdout, re.MULTILINE)
+        assert [line.split(" ")[0] for line in failed] == ["training", "`optim`:"]
+        assert launcher != "joblib" or "Done   3 out of   3" in answer.stderr
+        (made[launcher],) = (tmp_path / launcher / "out").glob("*lr-0.001*")
+    first = load_checkpoint(last_checkpoint(made.pop("basic")))
+    for folder in made.values():
+        assert not differences(first, load_checkpoint(last_checkpoint(folder)))
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start a sweep in a process group of its own; nothing of it is left at the end."""
+    line = [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), "-m", "study=smoke", *LONG]
     started: list[subprocess.Popen[str]] = []
 
     def begin(*words: str) -> subprocess.Popen[str]:
-        line = [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), "--multirun", *words]
-        started.append(
-            subprocess.Popen(
-                [*line, "study=smoke", "hydra.sweep.dir=out"], cwd=tmp_path,
-                stdout=subprocess.PIPE, text=True, start_new_session=True,
-            )
-        )  # fmt: skip
+        options: Any = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+        started.append(subprocess.Popen([*line, *words], cwd=tmp_path, **options))
         return started[-1]
 
     yield begin
     for process in started:
-        try:
+        with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
 
 
-def wait_for_rows(folder: Path, cells: int) -> None:
+def wait_for_rows(folder: Path, cells: int) -> list[Path]:
     deadline = time.monotonic() + 240
-    while sum(p.read_text().count("\n") > 2 for p in folder.glob("out/*/metrics.csv")) < cells:
+    tables = []
+    while sum(path.read_text().count("\n") > 2 for path in tables) < cells:
         assert time.monotonic() < deadline
         time.sleep(0.05)
+        tables = list(folder.glob("out/*/metrics.csv"))
+    return [path.parent for path in tables]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("launcher", "at_once"), [("basic", 1), ("joblib", 2)])
-@pytest.mark.parametrize("how", ["Ctrl-C", "SIGTERM"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
 def test_a_signal_stops_a_sweep_and_every_cell_is_saved(
     start: Callable[..., subprocess.Popen[str]],
     tmp_path: Path,
     launcher: str,
     at_once: int,
-    how: str,
+    number: signal.Signals,
 ) -> None:
     """Ctrl-C reaches every process of the terminal, SIGTERM the sweep alone."""
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    words = (*LONG[1:], f"hydra/launcher={launcher}", "seed=0", "method=none,drbpn,gru")
-    process = start(*words, *(["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []))
-    wait_for_rows(tmp_path, at_once)
-    if how == "Ctrl-C":
-        os.killpg(process.pid, signal.SIGINT)
-    else:
-        process.send_signal(signal.SIGTERM)
+    several = ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
+    process = start("seed=0", "method=none,drbpn,gru", f"hydra/launcher={launcher}", *several)
+    folders = wait_for_rows(tmp_path, at_once)
+    send = os.killpg if number == signal.SIGINT else os.kill
+    send(process.pid, number)
     said, _ = process.communicate(timeout=240)
-    assert process.returncode == (130 if how == "Ctrl-C" else 143), said
-    assert "0 of 3 cells are done" in said
+    assert process.returncode == 128 + number, said
     assert said.count("\nstopped: ") == 3
-    folders = sorted((tmp_path / "out").glob("Inv*"))
-    assert len(folders) == at_once
+    assert len(folders) == len(list((tmp_path / "out").glob("Inv*"))) == at_once
     for folder in folders:
-        rows = read_table(folder / "metrics.csv")
-        assert checkpoint_frames(folder) == int(rows[-1]["frames"])
+        assert checkpoint_frames(folder) == int(read_table(folder / "metrics.csv")[-1]["frames"])
     assert not list((tmp_path / "out").glob(".stop*"))
 
 
@@ -322,17 +278,15 @@ def test_a_signal_stops_a_sweep_and_every_cell_is_saved(
 def test_a_sweep_goes_on_after_it_was_killed(
     start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
-    words = (*LONG[1:], "seed=0", "method=none", "checkpoint.every_frames=128")
+    words = ("seed=0", "method=none", "checkpoint.every_frames=128")
     process = start(*words)
-    wait_for_rows(tmp_path, 1)
+    (folder,) = wait_for_rows(tmp_path, 1)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    (folder,) = (tmp_path / "out").glob("Inv*")
     reached = checkpoint_frames(folder) or 0
-    total = reached + 256
-    again = start(*words, f"total_frames={total}")
+    again = start(*words, f"total_frames={reached + 256}")
     said, _ = again.communicate(timeout=240)
     assert again.returncode == 0, said
     assert f"going on at {reached:,} steps" in said
     frames = [int(row["frames"]) for row in read_table(folder / "metrics.csv")]
-    assert frames == list(range(128, total + 1, 128))  # no rollout is missing, none is there twice
+    assert frames == list(range(128, reached + 257, 128))  # none is missing, none there twice
