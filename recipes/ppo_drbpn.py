@@ -10,12 +10,14 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
 from evaluation.folders import override
+from evaluation.while_training import evaluate_training
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -23,12 +25,11 @@ from tensordict import TensorDictBase
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from tqdm import tqdm
 from training.agent import add_primers, make_agent
-from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
+from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint, save_checkpoint
 from training.config import build, checked, command_line, explained, one_line, run_command
 from training.console import StopRequest, say, show
 from training.envs import env_name, make_env
 from training.errors import DivergedError, EnvironmentFault, UserError
-from training.evaluation import evaluate_training
 from training.ppo import add_advantages, finished_episodes, rollout_metrics
 from training.reward_scale import ReturnStatistics
 from training.run_folder import (
@@ -50,12 +51,6 @@ def assemble(config: DictConfig) -> Training:
     """Build everything a run needs, from its seed.
 
     The global generator of torch is seeded here: initial weights and sampled actions come from it.
-
-    Args:
-        config: of the run.
-
-    Returns:
-        The parts, before the first frame.
 
     Raises:
         UserError: if a part refuses its settings.
@@ -95,8 +90,11 @@ def collect(training: Training) -> TensorDictBase:
         EnvironmentFault: if the environment fails, or gives numbers that are none.
     """
     try:
-        # The collector writes every rollout into the same tensors; what is entered is not its own.
-        data = training.collector.rollout().copy()
+        with warnings.catch_warnings():
+            # The simulators warn of an engine that reset itself; the loop counts and says it.
+            warnings.filterwarnings("ignore", "MuJoCo gave up the state", RuntimeWarning)
+            # The collector writes every rollout into the same tensors: what is entered is ours.
+            data = training.collector.rollout().copy()
     except (BeliefDivergedError, LinAlgError):
         raise
     except Exception as error:  # whatever a simulator raises
@@ -120,10 +118,6 @@ def train_rollout(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Collect one rollout and learn from it.
 
-    Args:
-        training: changed in place.
-        config: of the run.
-
     Returns:
         What there is to log, times left out, and a row for each episode that finished.
     """
@@ -146,6 +140,7 @@ def train_rollout(
         "frames": training.frames,
         "episodes": training.episodes,
         "return": sum(recent) / len(recent) if recent else None,
+        "engine_resets": training.engine_resets,
         **metrics,
         **training.agent.summary(),
     }
@@ -171,10 +166,10 @@ def train(config: DictConfig, folder: Path) -> int:
         frames = evaluated = None
         if config.resume is None:
             if (folder / "config.yaml").exists():
-                raise UserError(
-                    f"`{folder}` holds a run already: name another folder, or "
-                    f"{override('resume', folder)}."
-                )
+                ended = "that ended before its first checkpoint: remove it, or name another folder"
+                goes_on = f"already: name another folder, or {override('resume', folder)}"
+                there = checkpoint_frames(folder) is not None
+                raise UserError(f"`{folder}` holds a run {goes_on if there else ended}.")
         else:
             path = last_checkpoint(folder)
             training.load_state_dict(load_checkpoint(path), str(path))
@@ -203,7 +198,7 @@ def _loop(
     training: Training, config: DictConfig, folder: Path, log: RunLog, stop: StopRequest
 ) -> None:
     saved = first = training.frames
-    first_seconds = training.seconds
+    first_seconds, resets = training.seconds, training.engine_resets
     keep, save_every = config.checkpoint.keep, config.checkpoint.every_frames
 
     def save(simulators: bool = True) -> None:
@@ -245,6 +240,13 @@ def _loop(
             row["wall_time"] = training.seconds
             log.rollout(row, finished)
             show(bar, row)
+            if not resets and row["engine_resets"]:
+                resets = row["engine_resets"]
+                bar.clear()
+                say(
+                    "an engine gave up its simulation's state and reset it: that episode ended as "
+                    "truncated; metrics.csv counts `engine_resets`"
+                )
             evaluate_when_due()
             if training.frames // save_every > saved // save_every:
                 save()
@@ -281,14 +283,7 @@ def _summary(rows: list[dict[str, Any]]) -> str:
 
 
 def job(config: DictConfig) -> int:
-    """Run one job of the command line.
-
-    Args:
-        config: what Hydra composed.
-
-    Returns:
-        The exit status.
-    """
+    """Run one job of the command line."""
     words, folder = command_line(), Path(HydraConfig.get().runtime.output_dir)
     config = checked(config, words)
     if config.resume is not None:

@@ -22,6 +22,17 @@ def pytest_configure() -> None:
         subprocess.run(build, cwd=ROOT, check=False)
 
 
+@pytest.fixture(scope="session")
+def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run the smoke experiment of the recipe once, to its end; nobody may change its folder."""
+    pytest.importorskip("hydra")
+    from recipe_tools import SMOKE, run
+
+    folder = tmp_path_factory.mktemp("run") / "smoke"
+    assert run(folder, *SMOKE) == 0
+    return folder
+
+
 @pytest.fixture(autouse=True)
 def _global_state() -> Iterator[None]:
     """Recipes set both; no test may depend on which one ran before."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import csv
+import functools
 import io
 import subprocess
 import sys
@@ -29,9 +31,14 @@ TIMES = ("steps_per_second", "wall_time")
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.2")
 
 
+@functools.cache
+def _composed(*overrides: str) -> DictConfig:
+    return composed_config(overrides)
+
+
 def make_config(*overrides: str) -> DictConfig:
     """Compose and check the configuration that a command line gives."""
-    return composed_config(overrides)
+    return copy.deepcopy(_composed(*overrides))
 
 
 def run(folder: Path, *overrides: str) -> int:

@@ -7,7 +7,6 @@ belief owes the recipe stands in test_recipe_beliefs.py.
 
 from __future__ import annotations
 
-import pytest
 import recipe_tools
 import torch
 from tensordict import TensorDict
@@ -50,9 +49,11 @@ def test_the_likelihood_is_that_of_the_entries_that_arrived():
     frames["normalized_observation"][:] = float("nan")
     frames["observed"][1, 2, 4] = True
     frames["normalized_observation"][1, 2, 4] = 0.7
-    value = module.foresight(torch.zeros(3, TIME, 64), frames)
+    value = module.prediction_head(torch.zeros(3, TIME, 64), frames)
     expected = torch.zeros(3, TIME)
-    ahead = module.foresight.mean(torch.cat([torch.zeros(64), frames["previous_action"][1, 2]]))
+    ahead = module.prediction_head.mean(
+        torch.cat([torch.zeros(64), frames["previous_action"][1, 2]])
+    )
     density = torch.distributions.Normal(ahead[4], 1.0).log_prob(torch.tensor(0.7))
     expected[1, 2] = density.detach()
     assert torch.allclose(value, expected, atol=1e-5)
@@ -67,13 +68,6 @@ def test_only_gru_action_reads_the_action():
             before = module(make_frames(3))["features"]
             after = module(changed.clone())["features"]
         assert torch.equal(before, after) is not reads
-
-
-def test_a_wrong_cell_is_named():
-    from training.errors import UserError
-
-    with pytest.raises(UserError, match="`cell` must be 'gru' or 'lstm', got 'rnn'"):
-        make_belief("gru belief.cell=rnn")
 
 
 def test_filling_holds_the_last_normalised_value_and_the_mean_before_the_first():

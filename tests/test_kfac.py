@@ -179,22 +179,6 @@ def test_a_long_step_is_shortened_to_the_divergence_asked_for(generator, max_kl)
     torch.testing.assert_close(true, predicted, rtol=1e-6, atol=0.0)
 
 
-def test_a_short_step_keeps_its_length_and_its_prediction(generator):
-    layer, inputs = network(generator, 3, 2)[0], normal(generator, N, 3)
-    far = copy.deepcopy(layer)
-    noise, target = white_noise(generator, N, 2), normal(generator, N, 2)
-    moves = []
-    for module, lr in ((layer, 1e-3), (far, 2e-3)):
-        optimizer = KFAC(module, **{**NUMBERS, "lr": lr})
-        old = observe(optimizer, module, inputs, noise)
-        (old - target).square().mean().backward()
-        predicted = optimizer.step()
-        moves.append(module(inputs) - old)
-        true = moves[-1].square().sum(-1).mean() / 2
-        torch.testing.assert_close(predicted, true, rtol=1e-6, atol=0.0)
-    torch.testing.assert_close(2 * moves[0], moves[1])
-
-
 def test_the_steps_are_averaged_by_momentum():
     parameter = nn.Parameter(torch.zeros(1, dtype=torch.float64))
     module = nn.Module()
@@ -237,14 +221,6 @@ def test_a_saved_state_goes_on_to_the_last_bit(generator):
         learn(again, other, *batch)
     for mine, theirs in zip(module.parameters(), other.parameters(), strict=True):
         assert torch.equal(mine, theirs)
-
-
-def test_recording_leaves_the_module_as_it_was(generator):
-    module = network(generator, 3, 4, 2)
-    optimizer = KFAC(module, **NUMBERS)
-    with pytest.raises(RuntimeError), optimizer.recording():
-        module(normal(generator, N, 5))
-    assert not any(layer._forward_hooks for layer in module)
 
 
 def test_a_step_before_any_curvature_is_refused(generator):

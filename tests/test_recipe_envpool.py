@@ -60,11 +60,6 @@ def test_a_resumed_run_says_in_one_line_that_it_goes_on_with_new_episodes(
     assert differences(first, second) == []
 
 
-def test_a_new_run_does_not_speak_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(tmp_path / "new", *SMOKE, "total_frames=128", "evaluation.final_episodes=0")
-    assert "new episodes" not in "".join(capsys.readouterr())
-
-
 def test_all_but_the_episodes_is_restored_and_the_first_ones_are_not_repeated() -> None:
     training, config = assembled(*SMOKE)
     start = training.collector._carrier["observation"].clone()

@@ -9,20 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 
 pytest.importorskip("hydra")
-from recipe_tools import make_config, read_table  # isort: skip
-
-from training.run import run
+from recipe_tools import read_table, run  # isort: skip
 
 
 def improvement(folder: Path, *overrides: str) -> float:
     """Train and return the ratio of the last to the first 20 episodes' mean return."""
-    threads = torch.get_num_threads()
-    with torch.random.fork_rng(devices=[]):
-        assert run(make_config("experiment=inverted_pendulum_test", *overrides), folder) == 0
-    torch.set_num_threads(threads)
+    assert run(folder, "experiment=inverted_pendulum_test", *overrides) == 0
     returns = [float(row["return"]) for row in read_table(folder / "episodes.csv")]
     assert len(returns) >= 40
     return sum(returns[-20:]) / sum(returns[:20])

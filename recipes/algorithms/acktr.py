@@ -139,11 +139,7 @@ class ACKTR:
             group["lr"] = lr
 
     def state_dict(self) -> dict[str, Any]:
-        """Return curvatures, momenta, step sizes, and the generator's state.
-
-        Returns:
-            Entries of the checkpoint, by name.
-        """
+        """Return curvatures, momenta, step sizes, and the generator's state."""
         return {
             "policy_optimizer": self.policy.state_dict(),
             "critic_optimizer": self.critic.state_dict(),
@@ -151,11 +147,7 @@ class ACKTR:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take up a saved state.
-
-        Args:
-            state: a checkpoint.
-        """
+        """Take up a saved state."""
         self.policy.load_state_dict(state["policy_optimizer"])
         self.critic.load_state_dict(state["critic_optimizer"])
         self.generator.set_state(state["curvature_generator"])

@@ -53,9 +53,6 @@ def solve_kronecker(gradient: Tensor, a: Tensor, g: Tensor, damping: float) -> T
         a: factor of the inputs, shape ``(in + 1, in + 1)``.
         g: factor of the scores, shape ``(out, out)``.
         damping: added to every eigenvalue; positive.
-
-    Returns:
-        The solution, in the shape of the gradient.
     """
     e, u = torch.linalg.eigh(a)
     f, v = torch.linalg.eigh(g)
@@ -138,11 +135,7 @@ class KFAC(torch.optim.Optimizer):
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Note inputs and outputs of the layers; one forward pass belongs inside.
-
-        Yields:
-            Nothing.
-        """
+        """Note inputs and outputs of the layers; one forward pass belongs inside."""
         self._recorded = []
 
         def note(_: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:

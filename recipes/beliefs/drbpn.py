@@ -29,11 +29,7 @@ _READ = {"observation": OBSERVATION}
 
 
 class SensorVariances(nn.Module):
-    """Turn the covariance of the state into variances of the sensors.
-
-    Args:
-        emission: of the filter.
-    """
+    """Turn the covariance of the state into variances of the sensors."""
 
     def __init__(self, emission: LinearGaussianEmission) -> None:
         super().__init__()
@@ -54,14 +50,7 @@ class SensorVariances(nn.Module):
 
 
 def observing(module: BeliefFilterModule) -> TensorDictSequential:
-    """Make the filter write everything that it knows of the sensors.
-
-    Args:
-        module: the filter as the agent uses it.
-
-    Returns:
-        A module with the same weights; see :mod:`beliefs`.
-    """
+    """Make the filter write everything that it knows of the sensors."""
     cov = ("belief", "cov")
     wanted = ["features", ("belief", "mean"), ("belief", "log_likelihood"), cov]
     wanted += [ESTIMATE, FORECAST, FORECAST_COV]
@@ -100,9 +89,6 @@ def build(
         transition: arguments of ``GaussianTransition``; ``residual`` None: where state <= obs.
         emission: arguments of ``LinearGaussianEmission``.
         initial: arguments of the belief before the first observation.
-
-    Returns:
-        The belief.
     """
     state = min(obs_dim, 32) if state_dim is None else state_dim
     moves = dict(transition)

@@ -35,39 +35,22 @@ class ObservationFeatures(nn.Module):
         return observation
 
 
-def build(*, obs_dim: int, action_dim: int, with_mask: bool) -> Belief:
+def build(*, obs_dim: int, action_dim: int, with_mask: bool, filled: bool) -> Belief:
     """Build the absence of a belief.
 
     Args:
         obs_dim: components of an observation.
         action_dim: components of an action; unused.
         with_mask: whether the heads also read which entries arrived.
-
-    Returns:
-        The belief.
+        filled: whether what arrives had its gaps filled: that is what is held of each sensor.
     """
     del action_dim
     module = TensorDictModule(
         ObservationFeatures(with_mask), in_keys=[OBSERVATION, "observed"], out_keys=["features"]
     )
-    return Belief(module, obs_dim * (2 if with_mask else 1))
-
-
-def build_filled(*, obs_dim: int, action_dim: int, with_mask: bool) -> Belief:
-    """Build a feed-forward policy on filled observations: conf fills and normalises them.
-
-    Args:
-        obs_dim: components of an observation.
-        action_dim: components of an action; unused.
-        with_mask: whether the heads also read which entries arrived.
-
-    Returns:
-        The belief; what it holds of a missing sensor is what it was filled with.
-    """
-    plain = build(obs_dim=obs_dim, action_dim=action_dim, with_mask=with_mask)
-    filled = TensorDictModule(nn.Identity(), in_keys=[OBSERVATION], out_keys=[ESTIMATE])
+    held = TensorDictModule(nn.Identity(), in_keys=[OBSERVATION], out_keys=[ESTIMATE])
     return Belief(
-        plain.module,
-        plain.feature_dim,
-        observing=lambda: TensorDictSequential(plain.module, filled),
+        module,
+        obs_dim * (2 if with_mask else 1),
+        observing=(lambda: TensorDictSequential(module, held)) if filled else None,
     )

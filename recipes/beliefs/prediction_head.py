@@ -1,4 +1,4 @@
-"""The auxiliary task of the networks without a model: foresee the next observation."""
+"""The auxiliary task of the networks without a model: predict the next observation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beliefs import FORECAST, FORECAST_COV, OBSERVATION
 from torchrl_drbpn.functional import inverse_softplus, positive_std, zero_missing
 
 
-class Foresight(nn.Module):
+class PredictionHead(nn.Module):
     r"""Say how likely what arrived was, given the hidden state before it.
 
     .. math:: \log N(x_t^{obs}; g(h_{t-1}, a_{t-1}), \mathrm{diag}(\sigma^2))
@@ -40,7 +40,7 @@ class Foresight(nn.Module):
         self.raw_std = nn.Parameter(inverse_softplus(torch.full((obs_dim,), init_std - min_std)))
 
     def forward(self, hidden: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Return the log-likelihood of what arrived, as foreseen from the step before.
+        """Return the log-likelihood of what arrived, as predicted from the step before.
 
         Args:
             hidden: hidden state before the step, shape ``(*, hidden)``.
@@ -51,12 +51,12 @@ class Foresight(nn.Module):
         """
         observed = tensordict.get("observed")
         seen = zero_missing(tensordict.get(OBSERVATION), observed)
-        mean, std = self.foresee(hidden, tensordict.get("previous_action"))
+        mean, std = self.predict(hidden, tensordict.get("previous_action"))
         normal = torch.distributions.Normal(mean, std, validate_args=False)
         density = normal.log_prob(seen)  # type: ignore[no-untyped-call]
         return zero_missing(density, observed).sum(-1)
 
-    def foresee(self, hidden: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
+    def predict(self, hidden: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation of the next observation.
 
         Args:
@@ -70,17 +70,19 @@ class Foresight(nn.Module):
         return mean, positive_std(self.raw_std, self.min_std)
 
 
-class Foreseen(nn.Module):
-    """Say what is foreseen from a stored state, one step at a time.
+class StoredPrediction(nn.Module):
+    """Predict the next observation from a stored state, one step at a time.
 
     Args:
-        foresight: the auxiliary task.
+        prediction_head: the auxiliary task.
         hidden_of: picks the hidden state, shape ``(*, hidden)``, out of the stored one.
     """
 
-    def __init__(self, foresight: Foresight, hidden_of: Callable[[Tensor], Tensor]) -> None:
+    def __init__(
+        self, prediction_head: PredictionHead, hidden_of: Callable[[Tensor], Tensor]
+    ) -> None:
         super().__init__()
-        self.foresight, self.hidden_of = foresight, hidden_of
+        self.prediction_head, self.hidden_of = prediction_head, hidden_of
 
     def forward(self, state: Tensor, action: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """Return the forecast and its covariance.
@@ -94,30 +96,27 @@ class Foreseen(nn.Module):
             Shapes ``(*, obs)`` and ``(*, obs, obs)``.
         """
         hidden = torch.where(is_init, 0.0, self.hidden_of(state))
-        mean, std = self.foresight.foresee(hidden, action)
+        mean, std = self.prediction_head.predict(hidden, action)
         return mean, torch.diag_embed(std.square().expand_as(mean))
 
 
-def foreseeing(
+def with_prediction(
     module: TensorDictModuleBase,
-    foresight: Foresight,
+    prediction_head: PredictionHead,
     state_key: NestedKey,
     hidden_of: Callable[[Tensor], Tensor],
 ) -> TensorDictSequential:
-    """Make a recurrent belief write what it foresees, before it looks.
+    """Make a recurrent belief write its prediction of the observation, before it reads it.
 
     Args:
         module: the belief as the agent uses it.
-        foresight: its auxiliary task.
+        prediction_head: its auxiliary task.
         state_key: where its recurrent state is read.
         hidden_of: picks the hidden state out of that.
-
-    Returns:
-        A module with the same weights; see :mod:`beliefs`.
     """
-    foreseen = TensorDictModule(
-        Foreseen(foresight, hidden_of),
+    prediction = TensorDictModule(
+        StoredPrediction(prediction_head, hidden_of),
         in_keys=[state_key, "previous_action", "is_init"],
         out_keys=[FORECAST, FORECAST_COV],
     )
-    return TensorDictSequential(foreseen, module)
+    return TensorDictSequential(prediction, module)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.modules import GRUModule, LSTMModule
 
 from beliefs import OBSERVATION, Belief
-from beliefs.prediction_head import Foresight, foreseeing
+from beliefs.prediction_head import PredictionHead, with_prediction
 
 _INPUT, _STATE, _STATE_C = "recurrent_input", "recurrent_state", "recurrent_state_c"
 
@@ -19,8 +19,8 @@ _INPUT, _STATE, _STATE_C = "recurrent_input", "recurrent_state", "recurrent_stat
 class RecurrentBelief(TensorDictModuleBase):
     r"""Run a recurrent network over (what arrived, which entries did[, previous action]).
 
-    Its auxiliary task, the paper's for DR-PPO and ADR-PPO, is to foresee the next observation:
-    see :class:`~beliefs.prediction_head.Foresight`.
+    Its auxiliary task, the paper's for DR-PPO and ADR-PPO, is to predict the next observation:
+    see :class:`~beliefs.prediction_head.PredictionHead`.
 
     .. math:: h_t = \mathrm{RNN}(h_{t-1}, [x_t, m_t, a_{t-1}])
 
@@ -62,7 +62,7 @@ class RecurrentBelief(TensorDictModuleBase):
             in_keys=[_INPUT, *states],
             out_keys=["features", *(("next", key) for key in states)],
         )
-        self.foresight = Foresight(
+        self.prediction_head = PredictionHead(
             hidden_size, obs_dim, action_dim, init_std=init_std, min_std=min_std
         )
         self.in_keys = [OBSERVATION, "observed", "previous_action", "is_init", *states]
@@ -70,14 +70,7 @@ class RecurrentBelief(TensorDictModuleBase):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write features, log-likelihood and the next hidden state.
-
-        Args:
-            tensordict: one step of any batch shape, or sequences under recurrent mode.
-
-        Returns:
-            The same tensordict.
-        """
+        """Write features, log-likelihood and the next hidden state."""
         observation = tensordict.get(OBSERVATION)
         observed = tensordict.get("observed")
         is_init = tensordict.get("is_init")
@@ -93,7 +86,7 @@ class RecurrentBelief(TensorDictModuleBase):
         for key in self.memory.out_keys[1:]:
             tensordict.set(key, data.get(key))
         before = self._before(features, stored, is_init)
-        tensordict.set(("belief", "log_likelihood"), self.foresight(before, tensordict))
+        tensordict.set(("belief", "log_likelihood"), self.prediction_head(before, tensordict))
         return tensordict
 
     def _before(self, features: Tensor, stored: Tensor | None, is_init: Tensor) -> Tensor:
@@ -105,52 +98,15 @@ class RecurrentBelief(TensorDictModuleBase):
 
 
 def last_layer(stored: Tensor) -> Tensor:
-    """Return the hidden state that the features are made of.
-
-    Args:
-        stored: shape ``(*, layers, hidden)``.
-
-    Returns:
-        Shape ``(*, hidden)``.
-    """
+    """Return the hidden state ``(*, hidden)`` of the features, of ``(*, layers, hidden)``."""
     return stored[..., -1, :]
 
 
-def build(
-    *,
-    obs_dim: int,
-    action_dim: int,
-    cell: Literal["gru", "lstm"],
-    hidden_size: int,
-    with_action: bool,
-    init_std: float,
-    min_std: float,
-) -> Belief:
-    """Build a recurrent belief.
-
-    Args:
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        cell: ``gru`` or ``lstm``.
-        hidden_size: width of the hidden state.
-        with_action: whether the network reads the previous action.
-        init_std: standard deviation of the foreseen observation at the start.
-        min_std: its floor.
-
-    Returns:
-        The belief.
-    """
-    module = RecurrentBelief(
-        obs_dim,
-        action_dim,
-        cell=cell,
-        hidden_size=hidden_size,
-        with_action=with_action,
-        init_std=init_std,
-        min_std=min_std,
-    )
+def build(*, obs_dim: int, action_dim: int, **settings: Any) -> Belief:
+    """Build a recurrent belief; the settings are those of :class:`RecurrentBelief`."""
+    module = RecurrentBelief(obs_dim, action_dim, **settings)
     return Belief(
         module,
-        hidden_size,
-        observing=lambda: foreseeing(module, module.foresight, _STATE, last_layer),
+        settings["hidden_size"],
+        observing=lambda: with_prediction(module, module.prediction_head, _STATE, last_layer),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
@@ -12,7 +14,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from beliefs import OBSERVATION, Belief
-from beliefs.prediction_head import Foresight, foreseeing
+from beliefs.prediction_head import PredictionHead, with_prediction
 
 _MEMORY: NestedKey = ("recurrent", "memory")
 _LENGTH: NestedKey = ("recurrent", "length")
@@ -166,7 +168,7 @@ class TransformerBelief(TensorDictModuleBase):
         width: of tokens and features.
         heads: attention heads; divides the width.
         layers: how many.
-        init_std: of the foreseen observation at the start, normalised observation units.
+        init_std: of the predicted observation at the start, normalised observation units.
         min_std: its floor.
 
     Raises:
@@ -195,7 +197,9 @@ class TransformerBelief(TensorDictModuleBase):
         self.embed = nn.Linear(2 * obs_dim + action_dim, width)
         self.layers = nn.ModuleList(MemoryLayer(width, heads, window) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
-        self.foresight = Foresight(width, obs_dim, action_dim, init_std=init_std, min_std=min_std)
+        self.prediction_head = PredictionHead(
+            width, obs_dim, action_dim, init_std=init_std, min_std=min_std
+        )
         self.in_keys = [OBSERVATION, "observed", "previous_action", "is_init", *_STATE]
         self.out_keys = [
             "features",
@@ -216,14 +220,7 @@ class TransformerBelief(TensorDictModuleBase):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write features, log-likelihood and the next memory.
-
-        Args:
-            tensordict: one step of any batch shape, or sequences under recurrent mode.
-
-        Returns:
-            The same tensordict.
-        """
+        """Write features, log-likelihood and the next memory."""
         observation = tensordict.get(OBSERVATION)
         seen = tensordict.get("observed").to(observation.dtype)
         token = torch.cat([observation, seen, tensordict.get("previous_action")], -1)
@@ -245,7 +242,7 @@ class TransformerBelief(TensorDictModuleBase):
 
         features = features.reshape(*batch, self.width)
         tensordict.set("features", features)
-        likelihood = self.foresight(before.reshape(*batch, self.width), tensordict)
+        likelihood = self.prediction_head(before.reshape(*batch, self.width), tensordict)
         tensordict.set(("belief", "log_likelihood"), likelihood)
         tensordict.set(("next", *_MEMORY), memories.reshape(*batch, *memories.shape[2:]))
         length = (step - start + 1).clamp_max(self.window - 1)
@@ -289,44 +286,13 @@ class TransformerBelief(TensorDictModuleBase):
         return self.norm(x), windows.permute(0, 2, 1, 4, 3)
 
 
-def build(
-    *,
-    obs_dim: int,
-    action_dim: int,
-    window: int,
-    width: int,
-    heads: int,
-    layers: int,
-    init_std: float,
-    min_std: float,
-) -> Belief:
-    """Build a transformer memory.
-
-    Args:
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        window: steps that a layer attends over.
-        width: of tokens and features.
-        heads: attention heads.
-        layers: how many.
-        init_std: of the foreseen observation at the start.
-        min_std: its floor.
-
-    Returns:
-        The belief.
-    """
-    module = TransformerBelief(
-        obs_dim,
-        action_dim,
-        window=window,
-        width=width,
-        heads=heads,
-        layers=layers,
-        init_std=init_std,
-        min_std=min_std,
-    )
+def build(*, obs_dim: int, action_dim: int, **settings: Any) -> Belief:
+    """Build a transformer memory; the settings are those of :class:`TransformerBelief`."""
+    module = TransformerBelief(obs_dim, action_dim, **settings)
     return Belief(
         module,
-        width,
-        observing=lambda: foreseeing(module, module.foresight, _HIDDEN, lambda hidden: hidden),
+        module.width,
+        observing=lambda: with_prediction(
+            module, module.prediction_head, _HIDDEN, lambda hidden: hidden
+        ),
     )

@@ -119,13 +119,6 @@ class Agent(nn.Module):
 def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
     """Build an agent, with weights from torch's global generator.
 
-    Args:
-        config: of the run.
-        env: whose observations and actions it has.
-
-    Returns:
-        The agent.
-
     Raises:
         UserError: if a part refuses its settings.
     """
@@ -151,11 +144,6 @@ def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
 def load_agent(folder: Path, config: DictConfig, env: TransformedEnv) -> tuple[Agent, int]:
     """Build the agent of a run with the weights of its last checkpoint.
 
-    Args:
-        folder: the run folder.
-        config: of the run.
-        env: whose observations and actions it has.
-
     Returns:
         The agent, and the environment steps it was trained for.
 
@@ -172,12 +160,7 @@ def load_agent(folder: Path, config: DictConfig, env: TransformedEnv) -> tuple[A
 
 
 def add_primers(env: TransformedEnv, agent: Agent) -> None:
-    """Append the entries of the belief module's recurrent state to an environment.
-
-    Args:
-        env: the environment; changed in place.
-        agent: whose belief module may be recurrent.
-    """
+    """Append the entries of the belief module's recurrent state to an environment."""
     primers = get_primers_from_module(agent.belief, warn=False)
     if primers is not None:
         env.append_transform(primers)
@@ -207,9 +190,6 @@ def make_heads(
         policy_gain: of the policy's last layer.
         value_gain: of the value's last layer.
         log_std: log of the action's standard deviation at the start.
-
-    Returns:
-        Actor and critic.
 
     Raises:
         ValueError: for another ``critic_input``.

@@ -31,9 +31,6 @@ def save_checkpoint(folder: Path, frames: int, state: dict[str, Any], *, keep: i
         state: tensors, numbers, texts, and containers of them.
         keep: how many of the latest checkpoints stay.
 
-    Returns:
-        The file.
-
     Raises:
         UserError: if it can't be written; those before it are left alone.
     """
@@ -81,12 +78,6 @@ def _digest(path: Path) -> str:
 def last_checkpoint(folder: Path) -> Path:
     """Return the latest checkpoint of a run.
 
-    Args:
-        folder: the run folder.
-
-    Returns:
-        The file.
-
     Raises:
         UserError: if there is none.
     """
@@ -104,9 +95,6 @@ def last_checkpoint(folder: Path) -> Path:
 def checkpoint_frames(folder: Path) -> int | None:
     """Return the environment steps of the latest checkpoint of a run.
 
-    Args:
-        folder: the run folder.
-
     Returns:
         Steps, or None where there is no checkpoint.
     """
@@ -116,9 +104,6 @@ def checkpoint_frames(folder: Path) -> int | None:
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint, after its sums have been checked.
-
-    Args:
-        path: the file.
 
     Returns:
         What was given to :func:`save_checkpoint`.

@@ -49,13 +49,6 @@ _LIMITS: dict[str, tuple[float, float]] = {
 def composed_config(overrides: Sequence[str] = (), name: str = "config") -> DictConfig:
     """Compose and check the configuration that a command line gives, outside a Hydra job.
 
-    Args:
-        overrides: words of the command line.
-        name: of the file in conf/.
-
-    Returns:
-        The configuration.
-
     Raises:
         UserError: if conf/ has no such group or key, or a value makes no sense.
     """
@@ -70,16 +63,11 @@ def composed_config(overrides: Sequence[str] = (), name: str = "config") -> Dict
 def choice(group: str, name: str, **values: Any) -> DictConfig:
     """Return an entry of a config group, such as ``choice("missingness", "mcar", eta=0.5)``.
 
-    Args:
-        group: a folder of conf/.
-        name: a file in it.
-        values: keys of the entry that take another value.
-
     Returns:
-        The entry, to be put into the configuration of a run: it may refer to other groups.
+        The entry, with other values for some of its keys. It may refer to other groups: put it
+        into the configuration of a run.
     """
-    node = OmegaConf.load(CONF / group / f"{name}.yaml")
-    assert isinstance(node, DictConfig)
+    node = cast(DictConfig, OmegaConf.load(CONF / group / f"{name}.yaml"))
     for key, value in values.items():
         if key not in node:
             raise UserError(f"`{group}={name}` has no `{key}`.")
@@ -204,14 +192,7 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def check_mode(mode: str) -> None:
-    """Check the name of a kind of action.
-
-    Args:
-        mode: ``sampled`` or ``mean``.
-
-    Raises:
-        UserError: if it is neither.
-    """
+    """Refuse what is not the name of a kind of action, ``sampled`` or ``mean``."""
     if mode not in ("sampled", "mean"):
         raise UserError(f"`modes` must hold sampled and mean, got {mode!r}.")
 
@@ -365,8 +346,11 @@ def explained(job: Callable[[], int | None], name: str = "config") -> int:
     try:
         return job() or 0
     except expected() as error:
-        sys.stderr.write(f"error: {explain(error, name)}\n")
-        return _USER_ERROR
+        line = explain(error, name)
+    except OSError as error:  # Hydra makes the run folder
+        line = f"`{error.filename}` can't be used: {error.strerror or error}."
+    sys.stderr.write(f"error: {line}\n")
+    return _USER_ERROR
 
 
 def explain(error: BaseException, file: str = "config") -> str:
@@ -395,14 +379,7 @@ def explain(error: BaseException, file: str = "config") -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error says, in one line of at most 400 characters.
-
-    Args:
-        error: any.
-
-    Returns:
-        The line.
-    """
+    """Return what an error says, in one line of at most 400 characters."""
     text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     return (" ".join(text.split()) or type(error).__name__)[:400]
 

@@ -17,11 +17,7 @@ STOP_FILE = "TORCHRL_DRBPN_STOP_FILE"
 
 
 def say(text: str) -> None:
-    """Print a line; nobody has to be listening.
-
-    Args:
-        text: the line.
-    """
+    """Print a line; nobody has to be listening."""
     try:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
@@ -31,12 +27,7 @@ def say(text: str) -> None:
 
 
 def show(bar: tqdm[Any], row: Mapping[str, Any]) -> None:
-    """Show frames, return, realised missing ratio, log-likelihood and speed in a progress bar.
-
-    Args:
-        bar: the bar.
-        row: numbers of a rollout.
-    """
+    """Show frames, return, realised missing ratio, log-likelihood and speed in a progress bar."""
     shown = (
         ("return", "return", "{:.1f}"),
         ("missing", "missing_ratio", "{:.3f}"),

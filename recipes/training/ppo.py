@@ -190,12 +190,6 @@ class GradientSteps:
     def take(self, loss: torch.Tensor) -> torch.Tensor:
         """Take one step down a loss.
 
-        Args:
-            loss: a scalar.
-
-        Returns:
-            Norm of the gradient.
-
         Raises:
             DivergedError: if it is no finite number.
         """
@@ -273,9 +267,6 @@ class PPO:
     def step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
         """Take one gradient step.
 
-        Args:
-            minibatch: sequences.
-
         Returns:
             What the loss reports, and ``grad_norm``.
         """
@@ -293,21 +284,13 @@ class PPO:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take up a saved state.
-
-        Args:
-            state: a checkpoint.
-        """
+        """Take up a saved state."""
         self.steps.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["minibatch_generator"])
 
 
 def check_finite(tensors: Mapping[str, torch.Tensor], kind: str) -> None:
     """Check that tensors hold finite numbers alone.
-
-    Args:
-        tensors: by name.
-        kind: what they are.
 
     Raises:
         DivergedError: naming the first that does not.

@@ -36,9 +36,6 @@ class ReturnStatistics(NamedTuple):
 
         Args:
             environments: rows of every rollout.
-
-        Returns:
-            Nothing seen.
         """
         zero = torch.zeros(1, dtype=torch.float64)
         return cls(zero, zero, zero, torch.zeros(environments, 1))

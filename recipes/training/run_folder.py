@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -38,7 +38,7 @@ EVALUATION_COLUMNS = (
 _METRICS = (
     *("frames", "episodes", "return", "missing_ratio", "log_likelihood", "loss_objective"),
     *("loss_critic", "loss_entropy", "loss_model", "kl", "clip_fraction", "ess"),
-    *("explained_variance", "grad_norm", "action_std", "lr"),
+    *("explained_variance", "grad_norm", "action_std", "lr", "engine_resets"),
 )
 
 
@@ -46,12 +46,7 @@ _METRICS = (
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text file whole or not at all.
-
-    Args:
-        path: the file.
-        text: its content.
-    """
+    """Write a text file whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
@@ -122,12 +117,7 @@ class Table:
 
 
 def is_evaluated(folder: Path, config: DictConfig) -> bool:
-    """Return whether a run has its final evaluation, as its configuration asks for it.
-
-    Args:
-        folder: the run folder.
-        config: of the run.
-    """
+    """Return whether a run has its final evaluation, as its configuration asks for it."""
     wanted = config.evaluation
     path = folder / "evaluation.csv"
     if not wanted.final_episodes:
@@ -145,12 +135,6 @@ def is_evaluated(folder: Path, config: DictConfig) -> bool:
 
 def load_config(folder: Path) -> DictConfig:
     """Read the configuration of a run, to build its parts anew.
-
-    Args:
-        folder: the run folder.
-
-    Returns:
-        The configuration, as it was composed.
 
     Raises:
         UserError: if there is none, or it can't be read.
@@ -175,18 +159,13 @@ def load_config(folder: Path) -> DictConfig:
 def read_config(folder: Path) -> dict[str, Any]:
     """Read the configuration of a run, for tables.
 
-    Args:
-        folder: the run folder.
-
     Returns:
         The configuration, resolved, as plain containers.
 
     Raises:
         UserError: if there is none, or it can't be read.
     """
-    plain = OmegaConf.to_container(load_config(folder), resolve=True)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    return cast(dict[str, Any], OmegaConf.to_container(load_config(folder), resolve=True))
 
 
 def resumed_config(composed: DictConfig, overrides: Sequence[str], folder: Path) -> DictConfig:
@@ -225,22 +204,13 @@ def resumed_config(composed: DictConfig, overrides: Sequence[str], folder: Path)
 
 
 def write_config(folder: Path, config: DictConfig) -> None:
-    """Write the configuration of a run, as it was composed.
-
-    Args:
-        folder: the run folder.
-        config: the configuration.
-    """
+    """Write the configuration of a run, as it was composed."""
     kept = OmegaConf.merge(config, {"resume": None})
     write_whole(folder / "config.yaml", OmegaConf.to_yaml(kept))
 
 
 def write_versions(folder: Path) -> None:
-    """Write the versions of what a run depends on, and the commit of its code.
-
-    Args:
-        folder: the run folder.
-    """
+    """Write the versions of what a run depends on, and the commit of its code."""
     system = f"{platform.system()} {platform.machine()}"
     versions = {"python": platform.python_version(), "platform": system}
     for name in _PACKAGES:
@@ -257,7 +227,7 @@ def _git(*arguments: str) -> str:
     """Return what git says about this checkout, or nothing."""
     try:
         answer = subprocess.run(
-            ["git", *arguments],
+            ["git", "--no-optional-locks", *arguments],  # it only reads
             cwd=Path(__file__).parent,
             capture_output=True,
             text=True,
@@ -273,9 +243,6 @@ def _git(*arguments: str) -> str:
 def locked(folder: Path) -> Iterator[None]:
     """Make a folder and keep every other run out of it until the end.
 
-    Args:
-        folder: the run folder.
-
     Raises:
         UserError: if another run is in it, or it can't be written.
     """
@@ -289,7 +256,18 @@ def locked(folder: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise UserError(f"`{folder}` is in use by a run that has not ended.") from error
-        yield
+        try:
+            for stale in folder.glob(".*.tmp"):  # of a writer that was killed
+                stale.unlink()
+            yield
+        except OSError as error:
+            where = error.filename or folder
+            raise UserError(
+                f"`{where}` can't be written or read: {error.strerror or error}."
+            ) from error
+        finally:
+            if [path.name for path in folder.iterdir()] == [".lock"]:  # refused: leave nothing
+                (folder / ".lock").unlink()
 
 
 # Numbers --------------------------------------------------------------------------------------
@@ -341,11 +319,7 @@ class RunLog:
         self._scalars("train", row)
 
     def evaluation(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Log an evaluation.
-
-        Args:
-            rows: one a kind of action.
-        """
+        """Log an evaluation."""
         self.evaluations.append(rows)
         for row in rows:
             self._scalars(f"evaluation_{row['mode']}", row)

@@ -54,162 +54,106 @@ def named_tasks() -> list[tuple[str, str]]:
 # Angles first, their velocities behind: Gymnasium's order of qpos and qvel ---------------------
 
 
-def _hinged(body: str, *joints: str) -> list[str]:
-    """Name a planar robot: the body's height and angle, the joints', then all velocities."""
-    return [
-        f"{body} height",
-        f"{body} angle",
-        *(f"{joint} angle" for joint in joints),
-        f"{body} x velocity",
-        f"{body} z velocity",
-        f"{body} angular velocity",
-        *(f"{joint} velocity" for joint in joints),
-    ]
+def _list(names: str) -> list[str]:
+    return [name.strip() for name in names.split(",")]
 
 
-def _grid(parts: tuple[str, ...], what: tuple[str, ...]) -> list[str]:
+def _grid(parts: list[str], what: list[str]) -> list[str]:
     """Name every quantity of every part, part by part."""
     return [f"{part} {quantity}" for part in parts for quantity in what]
 
 
-_AXES = ("x", "y", "z")
-_FREE_POSITION = ["torso height", *(f"torso orientation {axis}" for axis in ("w", *_AXES))]
-_FREE_VELOCITY = [
-    *(f"torso {axis} velocity" for axis in _AXES),
-    *(f"torso {axis} angular velocity" for axis in _AXES),
-]
+def _hinged(body: str, joints: str) -> list[str]:
+    """Name a planar robot: the body's height and angle, the joints', then all velocities."""
+    first = [f"{body} height", f"{body} angle", *_grid(_list(joints), ["angle"])]
+    moving = _grid([body], ["x velocity", "z velocity", "angular velocity"])
+    return [*first, *moving, *_grid(_list(joints), ["velocity"])]
+
+
+_FREE_POSITION = ["torso height", *_grid(["torso orientation"], ["w", "x", "y", "z"])]
+_FREE_VELOCITY = _grid(
+    ["torso"], [f"{axis} {of}velocity" for of in ("", "angular ") for axis in "xyz"]
+)
 # MuJoCo's cvel and cfrc_ext: rotation before translation.
-_FORCES = (*(f"torque {axis}" for axis in _AXES), *(f"force {axis}" for axis in _AXES))
-_SPEEDS = (*(f"com rotation {axis}" for axis in _AXES), *(f"com velocity {axis}" for axis in _AXES))
-_INERTIA = (
-    *(f"inertia {entry}" for entry in ("xx", "yy", "zz", "xy", "xz", "yz")),
-    *(f"mass offset {axis}" for axis in _AXES),
+_FORCES = [f"{what} {axis}" for what in ("torque", "force") for axis in "xyz"]
+_SPEEDS = [f"com {what} {axis}" for what in ("rotation", "velocity") for axis in "xyz"]
+_INERTIA = [
+    *_grid(["inertia"], ["xx", "yy", "zz", "xy", "xz", "yz"]),
+    *_grid(["mass offset"], ["x", "y", "z"]),
     "mass",
-)
-
-_HALFCHEETAH = _hinged(
-    "front tip", "back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot"
-)
-_HOPPER = _hinged("torso", "thigh", "leg", "foot")
-_WALKER2D = _hinged(
-    "torso", "right thigh", "right leg", "right foot", "left thigh", "left leg", "left foot"
-)
-_SWIMMER = [
-    "front angle",
-    "first rotor angle",
-    "second rotor angle",
-    "front x velocity",
-    "front y velocity",
-    "front angular velocity",
-    "first rotor velocity",
-    "second rotor velocity",
 ]
-_INVERTED_PENDULUM = ["cart position", "pole angle", "cart velocity", "pole angular velocity"]
-_INVERTED_DOUBLE_PENDULUM = [
-    "cart position",
-    "sine of first pole",
-    "sine of second pole",
-    "cosine of first pole",
-    "cosine of second pole",
-    "cart velocity",
-    "first pole angular velocity",
-    "second pole angular velocity",
-    "cart constraint force",
-]
-_REACHER = [
-    "cosine of first arm",
-    "cosine of second arm",
-    "sine of first arm",
-    "sine of second arm",
-    "target x",
-    "target y",
-    "first arm velocity",
-    "second arm velocity",
-    "fingertip to target x",
-    "fingertip to target y",
-]
-
-_ANT_JOINTS = _grid(("front left", "front right", "back left", "back right"), ("hip", "ankle"))
+_DOUBLE_PENDULUM = _list(
+    "cart position, sine of first pole, sine of second pole, cosine of first pole, "
+    "cosine of second pole, cart velocity, first pole angular velocity, "
+    "second pole angular velocity, cart constraint force"
+)
+_REACHER = _list(
+    "cosine of first arm, cosine of second arm, sine of first arm, sine of second arm, target x, "
+    "target y, first arm velocity, second arm velocity, fingertip to target x, "
+    "fingertip to target y"
+)
+_LEGS = _list("front left, front right, back left, back right")
+_ANT_JOINTS = _grid(_LEGS, ["hip", "ankle"])
 _ANT = [
     *_FREE_POSITION,
-    *(f"{joint} angle" for joint in _ANT_JOINTS),
+    *_grid(_ANT_JOINTS, ["angle"]),
     *_FREE_VELOCITY,
-    *(f"{joint} velocity" for joint in _ANT_JOINTS),
+    *_grid(_ANT_JOINTS, ["velocity"]),
 ]
-_ANT_LINKS = _grid(("front left", "front right", "back left", "back right"), ("hip", "leg", "foot"))
-_ANT_BODIES = ("torso", *_ANT_LINKS)
-
-_HUMANOID_JOINTS = (
-    "abdomen z",
-    "abdomen y",
-    "abdomen x",
-    "right hip x",
-    "right hip z",
-    "right hip y",
-    "right knee",
-    "left hip x",
-    "left hip z",
-    "left hip y",
-    "left knee",
-    "right shoulder 1",
-    "right shoulder 2",
-    "right elbow",
-    "left shoulder 1",
-    "left shoulder 2",
-    "left elbow",
+_ANT_BODIES = ["torso", *_grid(_LEGS, ["hip", "leg", "foot"])]
+_HUMANOID_JOINTS = _list(
+    "abdomen z, abdomen y, abdomen x, right hip x, right hip z, right hip y, right knee, "
+    "left hip x, left hip z, left hip y, left knee, right shoulder 1, right shoulder 2, "
+    "right elbow, left shoulder 1, left shoulder 2, left elbow"
 )
-_HUMANOID_BODIES = (
-    "torso",
-    "lower waist",
-    "pelvis",
-    "right thigh",
-    "right shin",
-    "right foot",
-    "left thigh",
-    "left shin",
-    "left foot",
-    "right upper arm",
-    "right lower arm",
-    "left upper arm",
-    "left lower arm",
+_HUMANOID_BODIES = _list(
+    "torso, lower waist, pelvis, right thigh, right shin, right foot, left thigh, left shin, "
+    "left foot, right upper arm, right lower arm, left upper arm, left lower arm"
 )
 
 
-def _humanoid(bodies: tuple[str, ...], actuated: tuple[str, ...]) -> list[str]:
+def _humanoid(bodies: list[str], actuated: list[str]) -> list[str]:
     """Name the Humanoid's components; the versions differ in constant zeros."""
     return [
         *_FREE_POSITION,
-        *(f"{joint} angle" for joint in _HUMANOID_JOINTS),
+        *_grid(_HUMANOID_JOINTS, ["angle"]),
         *_FREE_VELOCITY,
-        *(f"{joint} velocity" for joint in _HUMANOID_JOINTS),
+        *_grid(_HUMANOID_JOINTS, ["velocity"]),
         *_grid(bodies, _INERTIA),
         *_grid(bodies, _SPEEDS),
-        *(f"{joint} actuator force" for joint in actuated),
+        *_grid(actuated, ["actuator force"]),
         *_grid(bodies, _FORCES),
     ]
 
 
-_ROOT = tuple(f"root {i}" for i in range(6))
 _SAME_IN_BOTH = {
-    "HalfCheetah": _HALFCHEETAH,
-    "Hopper": _HOPPER,
-    "Walker2d": _WALKER2D,
-    "Swimmer": _SWIMMER,
-    "InvertedPendulum": _INVERTED_PENDULUM,
+    "HalfCheetah": _hinged(
+        "front tip", "back thigh, back shin, back foot, front thigh, front shin, front foot"
+    ),
+    "Hopper": _hinged("torso", "thigh, leg, foot"),
+    "Walker2d": _hinged(
+        "torso", "right thigh, right leg, right foot, left thigh, left leg, left foot"
+    ),
+    "Swimmer": _list(
+        "front angle, first rotor angle, second rotor angle, front x velocity, front y velocity, "
+        "front angular velocity, first rotor velocity, second rotor velocity"
+    ),
+    "InvertedPendulum": _list("cart position, pole angle, cart velocity, pole angular velocity"),
 }
 _TABLES: dict[tuple[str, str], list[str]] = {
     **{(task, version): names for task, names in _SAME_IN_BOTH.items() for version in ("v4", "v5")},
     ("InvertedDoublePendulum", "v4"): [
-        *_INVERTED_DOUBLE_PENDULUM,
-        "first pole constraint force",
-        "second pole constraint force",
+        *_DOUBLE_PENDULUM,
+        *_grid(["first pole", "second pole"], ["constraint force"]),
     ],
-    ("InvertedDoublePendulum", "v5"): _INVERTED_DOUBLE_PENDULUM,
+    ("InvertedDoublePendulum", "v5"): _DOUBLE_PENDULUM,
     ("Reacher", "v4"): [*_REACHER, "fingertip to target z"],
     ("Reacher", "v5"): _REACHER,
     ("Ant", "v4"): _ANT,
     ("Ant", "v5"): [*_ANT, *_grid(_ANT_BODIES, _FORCES)],
-    ("Humanoid", "v4"): _humanoid(("world", *_HUMANOID_BODIES), (*_ROOT, *_HUMANOID_JOINTS)),
+    ("Humanoid", "v4"): _humanoid(
+        ["world", *_HUMANOID_BODIES], [*(f"root {i}" for i in range(6)), *_HUMANOID_JOINTS]
+    ),
     ("Humanoid", "v5"): _humanoid(_HUMANOID_BODIES, _HUMANOID_JOINTS),
 }
 

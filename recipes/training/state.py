@@ -123,6 +123,11 @@ class Training:
                 self.env.base_env.set_seed(int(torch.randint(2**31, ())))
                 self.start_episodes()
 
+    @property
+    def engine_resets(self) -> int:
+        """Return how many episodes a physics engine has cut off by resetting itself."""
+        return int(getattr(self.env.base_env, "engine_resets", torch.zeros(1)).sum())
+
     def start_episodes(self) -> None:
         """Begin new episodes in every environment."""
         self.collector.reset()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from omegaconf import DictConfig
+from training.state import Training
+
 from evaluation.episodes import Episodes, evaluate
 from evaluation.trained import TrainedAgent
-from omegaconf import DictConfig
-
-from training.state import Training
 
 
 def evaluate_training(
