@@ -113,6 +113,7 @@ def test_the_step_size_follows_the_divergence(desired: float, factor: float) -> 
     assert steps[1] == pytest.approx(0.03 * factor)
 
 
+@pytest.mark.slow
 def test_the_divergence_comes_to_the_one_asked_for() -> None:
     training, config = assembled(*SMOKE, "algo.policy.momentum=0.5")
     kls = [train_rollout(training, config)[0]["kl"] for _ in range(40)]

@@ -167,6 +167,7 @@ def test_a_resumed_run_equals_one_that_never_stopped(
     assert_same_run(straight, broken)
 
 
+@pytest.mark.slow
 def test_a_signal_saves_and_the_resumed_run_equals_one_that_never_stopped(tmp_path: Path) -> None:
     longer = (*SMOKE, "total_frames=2048", "evaluation.every_frames=1024")
     straight, stopped = tmp_path / "straight", tmp_path / "stopped"
@@ -518,6 +519,7 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own(
     assert all(Path(name).is_dir() for name in names)
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_does_not_stop_a_run(tmp_path: Path) -> None:
     words = [*SMOKE, "total_frames=256", "hydra.run.dir=run", "evaluation.every_frames=0"]
     job = subprocess.Popen(
