@@ -13,8 +13,9 @@ import torch
 ROOT = Path(__file__).parents[1]
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Build the native filter where it is not there or older than its source; optional as ever."""
+    config.addinivalue_line("filterwarnings", "ignore:the filter runs in PyTorch")
     sources = [*ROOT.glob("torchrl_drbpn/csrc/*"), ROOT / "setup.py"]
     there = [path.stat().st_mtime for path in ROOT.glob("torchrl_drbpn/_native_*")]
     if not there or min(there) < max(path.stat().st_mtime for path in sources):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+from dataclasses import replace
 from typing import NamedTuple
 
 import oracles
@@ -352,6 +353,22 @@ class Negative(LinearGaussianEmission):
         return super().compact_cov() - 1
 
 
+class NegativeQ(GaussianTransition):
+    def cov(self, mean=None, action=None):
+        return super().cov(mean, action) - torch.eye(self.state_dim)
+
+
+class Skew(GaussianTransition):
+    def forward(self, mean, action):
+        predicted = super().forward(mean, action)
+        return predicted._replace(cov=predicted.cov + 0.01 * torch.ones(3, 3).triu(1))
+
+
+class NegativeStart(BeliefFilter):
+    def state_space(self):
+        return replace(super().state_space(), initial_cov=-torch.ones(3))
+
+
 def test_the_forward_of_a_subclass_counts():
     model, inputs = make_filter(OBS, ACTION, F64, state=3), make_inputs(3)
     for part, subclass in (("emission", Scaled), ("transition", Turned)):
@@ -367,15 +384,19 @@ def test_the_forward_of_a_subclass_counts():
 
 
 @pytest.mark.parametrize(
-    ("emission", "message"),
+    ("kind", "part", "message"),
     [
-        (Squared(OBS, 3, ACTION), "`emission` must be affine"),
-        (Negative(OBS, 3, ACTION), "`emission, R` is not symmetric positive definite"),
+        (BeliefFilter, {"emission": Squared(OBS, 3, ACTION)}, "`emission` must be affine"),
+        (BeliefFilter, {"emission": Negative(OBS, 3, ACTION)}, "`emission, R` is not symmetric"),
+        (BeliefFilter, {"transition": NegativeQ(3, ACTION)}, "`transition, Q` is not symmetric"),
+        (BeliefFilter, {"transition": Skew(3, ACTION)}, "`transition, Q` is not symmetric"),
+        (NegativeStart, {}, "`initial_cov` is not symmetric positive definite"),
     ],
+    ids=["not affine", "R", "Q", "Q not symmetric", "P_0"],
 )
-def test_a_model_that_cannot_be_is_named_at_construction(emission, message):
+def test_a_model_that_cannot_be_is_named_at_construction(kind, part, message):
     with pytest.raises(ValueError, match=message):
-        BeliefFilter(OBS, ACTION, 3, emission=emission)
+        kind(OBS, ACTION, 3, **part)
 
 
 BAD = {
@@ -389,19 +410,19 @@ BAD = {
     ),
     "observation of another size": (
         {"observation": torch.ones(3, 6, 4, dtype=F64)},
-        r"`observation` must have shape \(\*batch, obs\) = \(3, 6, 5\).*another environment",
+        r"`observation` must be float64 of shape \(\*batch, obs\) = \(3, 6, 5\).*environment",
     ),
     "action of another size": (
         {"previous_action": torch.ones(3, 6, 1, dtype=F64)},
-        r"`previous_action` must have shape \(\*batch, action\) = \(3, 6, 2\)",
+        r"`previous_action` must be float64 of shape \(\*batch, action\) = \(3, 6, 2\)",
     ),
     "float64 in float32": (
         {"observation": torch.ones(3, 6, OBS, dtype=torch.float32)},
-        "`observation` is torch.float32, the filter's parameters are torch.float64.*DoubleToFloat",
+        "`observation` must be float64 of shape .*got float32 .*DoubleToFloat",
     ),
     "reset of ints": (
         {"reset": torch.zeros(3, 6, dtype=torch.int64)},
-        r"`reset` must be bool of shape \(\*batch,\), got int64 \(3, 6\)",
+        r"`reset` must be bool of shape \(\*batch,\) = .* got int64 \(3, 6\)",
     ),
     "mean of another size": (
         {"mean": torch.zeros(3, 9, dtype=F64)},
@@ -424,7 +445,9 @@ def test_bad_input_is_one_clear_line(method, case):
 
 def test_a_float64_observation_in_a_float32_filter_is_refused():
     inputs = make_inputs(3)
-    with pytest.raises(ValueError, match=r"`observation` is torch.float64.*DoubleToFloat"):
+    with pytest.raises(
+        ValueError, match=r"`observation` must be float32 .*got float64 .*DoubleToFloat"
+    ):
         make_filter(OBS, ACTION, torch.float32, state=3)(*inputs)
 
 

@@ -498,7 +498,7 @@ def test_an_input_of_wrong_size_is_one_clear_line(form, name):
     names = ("mean", "previous_action", "observation", "observed", "reset")
     arguments = dict(zip(names, problem.arguments(), strict=True))
     arguments[name] = arguments[name][..., :-1]
-    with pytest.raises(ValueError, match=f"`{name}` must have shape"):
+    with pytest.raises(ValueError, match=f"`{name}` must be float64 of shape"):
         problem.run(form, *arguments.values())
 
 
@@ -510,7 +510,7 @@ def test_an_input_of_wrong_size_is_one_clear_line(form, name):
         ("transition_cov", torch.ones(2, 3, 3), "`transition_cov` must have shape"),
         ("initial_mean", torch.zeros(4), "`initial_mean` must have shape"),
         ("emission_offset", torch.zeros(5).float(), "`emission_offset` is torch.float32"),
-        ("action_matrix", torch.zeros(5), r"`action_matrix` \(obs, action\)"),
+        ("action_matrix", torch.zeros(5), r"`action_matrix` of shape \(obs, action\)"),
         ("emission_matrix", torch.zeros(5, 3).long(), "must be floating point"),
     ],
 )

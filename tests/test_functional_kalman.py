@@ -563,6 +563,37 @@ def test_step_likelihoods_sum_to_one_joint_gaussian_when_the_covariance_is_propa
     assert_equal(total, oracles.joint_log_likelihood(system, data, row=0))
 
 
+def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagated():
+    statespace = pytest.importorskip("statsmodels.tsa.statespace.kalman_filter")
+    system = oracles.random_system(3, 5, seed=4, full_noise=True)
+    data = oracles.simulate(system, batch=1, time=30, seed=4)
+    x, observed = data.observation[0], data.observed[0]
+    offsets = system.offset(data.previous_action[0])
+    theirs = statespace.KalmanFilter(k_endog=5, k_states=3)
+    theirs.bind(torch.where(observed, x, torch.nan).numpy())
+    theirs["design"], theirs["obs_cov"] = system.matrix.numpy(), system.noise.numpy()
+    theirs["obs_intercept"] = offsets.T.numpy()
+    theirs["transition"], theirs["selection"] = system.dynamics.numpy(), torch.eye(3).numpy()
+    moves = data.previous_action[0, 1:] @ system.control.T  # theirs lead from a step to the next
+    theirs["state_intercept"] = torch.cat([moves, torch.zeros(1, 3)]).double().T.numpy()
+    theirs["state_cov"] = system.transition_cov.numpy()
+    theirs.initialize_known(system.initial_mean.numpy(), system.initial_cov.numpy())
+    truth = theirs.filter()
+
+    predicted = Belief(system.initial_mean, system.initial_cov)
+    for t in range(30):
+        step = (predicted, x[t], observed[t], system.matrix, system.noise, offsets[t])
+        ll, filtered = F.log_likelihood(*step), F.update(*step)
+        assert_equal(filtered.mean, torch.from_numpy(truth.filtered_state[:, t]), 1e-8)
+        assert_equal(filtered.cov, torch.from_numpy(truth.filtered_state_cov[:, :, t]), 1e-8)
+        assert_equal(ll, torch.tensor(truth.llf_obs[t], dtype=torch.float64), 1e-8)
+        if t < 29:
+            predicted = F.predict(
+                filtered, system.transition, system.transition_cov, data.previous_action[0, t + 1],
+                jacobian=system.dynamics,
+            )  # fmt: skip
+
+
 # --- manners ------------------------------------------------------------------------------------
 
 

@@ -12,9 +12,11 @@ state (diagonal R, obs > state). A Q that depends on the state takes :mod:`.kalm
 
 from __future__ import annotations
 
+import functools
 import math
+import warnings
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,7 +25,6 @@ from torchrl_drbpn.functional import native
 from torchrl_drbpn.functional.gaussian import (
     LOG_2PI,
     Belief,
-    check_observed,
     masked_cov,
     without_autocast,
     zero_missing,
@@ -34,8 +35,12 @@ from torchrl_drbpn.functional.state_space import StateSpace, predict_step
 __all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
 
 Form = Literal["auto", "pytorch", "native"]
-# A function of a predicted covariance (state, state), and its value at every step.
-EveryStep = Callable[[Callable[[Tensor], Tensor]], Tensor]
+# observation, observed, action, reset, use_stored_state, stored_mean as (batch, time, ...), and the
+# mean (batch, state) before.
+Sequence = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor]
+# Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step.
+Choose = Callable[[Tensor], Tensor]
+Gains = tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]
 
 
 class FilterOutput(NamedTuple):
@@ -104,9 +109,11 @@ def filter_step(
         >>> bool((out.mean == 1).all()), bool((out.log_likelihood == 0).all())
         (True, True)
     """
-    out = filter_sequence(
-        model, mean, previous_action.unsqueeze(-2), observation.unsqueeze(-2),
-        observed.unsqueeze(-2), reset.unsqueeze(-1), return_cov=return_cov, form=form,
+    steps = tuple(reset.shape)
+    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset)
+    out = _filter(
+        model, observation.unsqueeze(-2), observed.unsqueeze(-2), previous_action.unsqueeze(-2),
+        reset.unsqueeze(-1), None, None, mean, return_cov, form,
     )  # fmt: skip
     cov = None if out.cov is None else out.cov.squeeze(-3)
     return FilterOutput(out.mean.squeeze(-2), cov, out.log_likelihood.squeeze(-1))
@@ -164,59 +171,74 @@ def filter_sequence(
         >>> out.mean.shape, out.log_likelihood.shape
         (torch.Size([4, 10, 2]), torch.Size([4, 10]))
     """
-    if form not in ("auto", "pytorch", "native"):
-        raise ValueError(f"`form` must be 'auto', 'pytorch' or 'native', got {form!r}.")
     if (use_stored_state is None) != (stored_mean is None):
         raise ValueError(
             "`use_stored_state` and `stored_mean` come together: the one says where, the other "
             "from which belief."
         )
-    batch, time = reset.shape[:-1], reset.shape[-1]
-    data = (
-        ("mean", mean, (*batch, model.state_dim)),
-        ("previous_action", previous_action, (*batch, time, model.action_dim)),
-        ("observation", observation, (*batch, time, model.obs_dim)),
-        ("stored_mean", stored_mean, (*batch, time, model.state_dim)),
-        ("use_stored_state", use_stored_state, (*batch, time)),
-    )
-    for name, value, shape in data:
-        if value is not None and value.shape != shape:
-            raise ValueError(
-                f"`{name}` must have shape {shape}, got {tuple(value.shape)}: `reset` "
-                f"{tuple(reset.shape)} says batch and time, the model the rest."
-            )
-    check_observed(observation, observed)
+    steps = tuple(reset.shape)
+    model.check_inputs(
+        steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
+        stored_mean,
+    )  # fmt: skip
+    return _filter(
+        model, observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
+        return_cov, form,
+    )  # fmt: skip
 
-    count = math.prod(batch)  # not -1: there may be no step at all
 
-    def rows(x: Tensor | None) -> Tensor | None:
-        return None if x is None else x.reshape(count, *x.shape[len(batch) :])
+def _filter(
+    model: StateSpace,
+    observation: Tensor,
+    observed: Tensor,
+    action: Tensor,
+    reset: Tensor,
+    use_stored_state: Tensor | None,
+    stored_mean: Tensor | None,
+    mean: Tensor,
+    return_cov: bool,
+    form: Form,
+) -> FilterOutput:
+    """Choose the form, and filter checked inputs as rows."""
+    if form not in ("auto", "pytorch", "native"):
+        raise ValueError(f"`form` must be 'auto', 'pytorch' or 'native', got {form!r}.")
+    *batch, time = reset.shape
 
-    sequence: tuple[Any, ...] = tuple(
-        rows(x)
-        for x in (
-            observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
-        )
+    def rows(x: Tensor) -> Tensor:  # not -1: there may be no step at all
+        return x.reshape(math.prod(batch), *x.shape[len(batch) :])
+
+    sequence: Sequence = (
+        rows(observation), rows(observed), rows(action), rows(reset),
+        None if use_stored_state is None else rows(use_stored_state),
+        None if stored_mean is None else rows(stored_mean), rows(mean),
     )  # fmt: skip
     reason: str | None = "PyTorch was asked for"
     if form != "pytorch":
-        reason = native.unsupported_reason(model, observation, previous_action, stored_mean, mean)
-        if form == "native" and reason is not None:
+        reason = native.unsupported_reason(model, observation, action, stored_mean, mean)
+        if reason is not None and form == "native":
             raise ValueError(f"`form` 'native' cannot run here: {reason}. Use form='auto'.")
+        if not torch.compiler.is_compiling() and reason and reason == native.native_status():
+            _warn_once(reason)
     with without_autocast(mean):
-        cov: Tensor | None
-        if reason is None:
-            filtered, ll = native.filter_rows(model, sequence)
-            cov = filtered_cov(model, observed, reset) if return_cov else None
-        elif isinstance(model.transition_cov, Tensor):
-            filtered, ll = _run(model, *sequence)
-            cov = filtered_cov(model, observed, reset) if return_cov else None
+        cov = None
+        if not isinstance(model.transition_cov, Tensor):
+            filtered, cov, ll = _run_step_by_step(model, *sequence)
+            cov = cov.reshape(*batch, *cov.shape[1:]) if return_cov else None
         else:
-            filtered, covs, ll = _run_step_by_step(model, *sequence)
-            cov = covs.reshape(*batch, *covs.shape[1:]) if return_cov else None
+            if reason is None:
+                filtered, ll = native.filter_rows(model, sequence)
+            else:
+                filtered, ll = run_in_pytorch(model, *sequence)
+            if return_cov:
+                cov = filtered_cov(model, observed, reset)
     return FilterOutput(
         filtered.reshape(*batch, time, model.state_dim), cov, ll.reshape(*batch, time)
     )
+
+
+@functools.cache
+def _warn_once(reason: str) -> None:
+    warnings.warn(f"the filter runs in PyTorch, several times slower: {reason}.", stacklevel=2)
 
 
 def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
@@ -256,7 +278,7 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
 
 
 # ------------------------------------------------------------------ the PyTorch form
-def _run(
+def run_in_pytorch(
     model: StateSpace,
     observation: Tensor,
     observed: Tensor,
@@ -270,47 +292,44 @@ def _run(
 
     In float64 but for the transition: with R at its floor float32 loses most digits of a gain.
     """
-    H, Q, P0 = (
-        x.double() for x in (model.emission_matrix, model.constant_cov(), model.full_initial_cov())
-    )
-    first = reset[..., None, None]
+    H, dtype = model.emission_matrix.double(), mean.dtype
+    covs = torch.stack([model.full_initial_cov(), model.constant_cov()]).double()
 
-    def every_step(f: Callable[[Tensor], Tensor]) -> Tensor:
-        return torch.where(first, f(P0), f(Q))
+    def choose(pair: Tensor) -> Tensor:
+        first = reset.view(*reset.shape, *(1,) * (pair.ndim - 1))
+        return torch.where(first, pair[0], pair[1])
 
     gains = _information if model.information_form else _innovation
-    gain, likelihood = gains(H, model.emission_cov.double(), every_step, observed)
+    gain, likelihood = gains(H, model.emission_cov.double(), covs, choose, observed)
     # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
     y = zero_missing(observation, observed).double() - model.offset(action).double()
     innovations, moves, filtered, H_t = [], [], [], H.mT
     steps = (y, gain, action, reset.unsqueeze(-1), use_stored_state, stored_mean)
     for y_t, gain_t, action_t, reset_t, use_t, stored_t in zip(
-        *((None,) * y.shape[1] if x is None else x.unbind(1) for x in steps), strict=True
+        *((None,) * reset.shape[1] if x is None else x.unbind(1) for x in steps), strict=True
     ):
         if use_t is not None:
             mean = torch.where(use_t.unsqueeze(-1), stored_t, mean)
         m = model.predicted_mean(mean, action_t, reset_t).double()
         v = torch.addmm(y_t, m, H_t, alpha=-1)
         move = torch.bmm(gain_t, v.unsqueeze(-1)).squeeze(-1)
-        mean = (m + move).to(mean.dtype)
+        mean = (m + move).to(dtype)
         innovations.append(v)
         moves.append(move)
         filtered.append(mean)
     if not filtered:
-        return mean.unsqueeze(1)[:, :0], y.sum(-1).to(mean.dtype)
+        return mean.unsqueeze(1)[:, :0], y.sum(-1).to(dtype)
     residual = zero_missing(torch.stack(innovations, 1), observed)
     ll = likelihood(residual, moves)
-    return torch.stack(filtered, 1), torch.where(observed.any(-1), ll, 0.0).to(mean.dtype)
+    return torch.stack(filtered, 1), torch.where(observed.any(-1), ll, 0.0).to(dtype)
 
 
-def _innovation(
-    H: Tensor, R: Tensor, every_step: EveryStep, observed: Tensor
-) -> tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]:
+def _innovation(H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor) -> Gains:
     """Return the gains K = P H' M' inv(M S M') M and the log-likelihood, obs x obs factorised."""
     full_R = R.diag() if R.ndim == 1 else R
-    factor, log_det = _factor(masked_cov(every_step(lambda P: H @ P @ H.mT + full_R), observed))
-    cross = every_step(lambda P: H @ P)
-    gain = torch.cholesky_solve(zero_missing(cross, observed.unsqueeze(-1)), factor).mT
+    cross = H @ covs
+    factor, log_det = _factor(masked_cov(choose(cross @ H.mT + full_R), observed))
+    gain = torch.cholesky_solve(zero_missing(choose(cross), observed.unsqueeze(-1)), factor).mT
 
     def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
         del moves
@@ -321,9 +340,7 @@ def _innovation(
     return gain, likelihood
 
 
-def _information(
-    H: Tensor, R: Tensor, every_step: EveryStep, observed: Tensor
-) -> tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]:
+def _information(H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor) -> Gains:
     r"""Return the gains K = inv(inv(P) + H' W H) H' W and the log-likelihood, W = diag(m / r).
 
     .. math::
@@ -333,13 +350,11 @@ def _information(
     with :math:`\delta = K v`. Both terms of the quadratic form are sums of squares, so that nothing
     cancels where R is small.
     """
-    state = H.shape[-1]
     weight = observed / R
     outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
-    prior = every_step(lambda P: torch.cholesky_inverse(_factor(P)[0]))
-    gathered = (weight @ outer).view(*weight.shape[:-1], state, state)
-    factor, log_det = _factor(gathered + prior)
-    log_det = log_det + every_step(lambda P: _factor(P)[1][..., None, None]).flatten(-3)
+    prior_factor, prior_log_det = _factor(covs)
+    prior = choose(torch.cholesky_inverse(prior_factor))
+    factor, log_det = _factor((weight @ outer).view(prior.shape) + prior)
     gain = torch.cholesky_solve((weight.unsqueeze(-1) * H).mT, factor)
 
     def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
@@ -348,7 +363,7 @@ def _information(
         by_prior = (prior @ move.unsqueeze(-1)).squeeze(-1)
         quadratic = (weight * left.square()).sum(-1) + (move * by_prior).sum(-1)
         log_noise = observed.to(R.dtype) @ (R.log() + LOG_2PI)
-        return -0.5 * (quadratic + log_noise + log_det)
+        return -0.5 * (quadratic + log_noise + log_det + choose(prior_log_det))
 
     return gain, likelihood
 
@@ -387,6 +402,3 @@ def _run_step_by_step(
         nothing = mean.unsqueeze(1)[:, :0]
         return nothing, nothing.unsqueeze(-1) * nothing.unsqueeze(-2), nothing.sum(-1)
     return torch.stack(means, 1), torch.stack(covs, 1), torch.stack(lls, 1)
-
-
-native.register_gradient(_run)

@@ -12,6 +12,7 @@ from torch.nn.functional import softplus
 
 __all__ = [
     "Belief",
+    "NotPositiveDefiniteError",
     "as_matrix",
     "check_observed",
     "factorise",
@@ -46,20 +47,12 @@ class Belief(NamedTuple):
     cov: Tensor
 
 
+class NotPositiveDefiniteError(ValueError):
+    """Report a covariance that has no Cholesky factor."""
+
+
 def check_observed(observation: Tensor, observed: Tensor) -> None:
-    """Refuse a mask that would broadcast or be read as numbers.
-
-    Args:
-        observation: shape ``(*batch, obs)``.
-        observed: bool, the same shape.
-
-    Raises:
-        ValueError: if the mask is not bool or not of the observation's shape.
-
-    Example:
-        >>> import torch
-        >>> check_observed(torch.zeros(2, 3), torch.ones(2, 3, dtype=torch.bool))
-    """
+    """Refuse a mask that would broadcast or be read as numbers."""
     if observed.dtype is not torch.bool or observed.shape != observation.shape:
         raise ValueError(
             f"`observed` must be bool of the observation's shape {tuple(observation.shape)}, got "
@@ -68,24 +61,7 @@ def check_observed(observation: Tensor, observed: Tensor) -> None:
 
 
 def as_matrix(name: str, cov: Tensor, dim: int) -> Tensor:
-    """Return a covariance as a matrix; variances become its diagonal, never a broadcast row.
-
-    Args:
-        name: of the argument, for the error.
-        cov: shape ``(*batch, dim, dim)``, or ``(dim,)`` for the variances of a diagonal one.
-        dim: number of components.
-
-    Returns:
-        Shape ``(*batch, dim, dim)``.
-
-    Raises:
-        ValueError: for any other shape.
-
-    Example:
-        >>> import torch
-        >>> as_matrix("emission_cov", torch.tensor([1.0, 2.0]), 2).tolist()
-        [[1.0, 0.0], [0.0, 2.0]]
-    """
+    """Return a covariance ``(..., dim, dim)``; of variances ``(dim,)`` the diagonal matrix."""
     if cov.shape[-2:] == (dim, dim):
         return cov
     if cov.shape == (dim,):
@@ -97,27 +73,11 @@ def as_matrix(name: str, cov: Tensor, dim: int) -> Tensor:
 
 
 def factorise(name: str, cov: Tensor) -> Tensor:
-    """Return the lower Cholesky factor of a covariance, or say that it has none.
-
-    Args:
-        name: what the covariance is, for the error.
-        cov: shape ``(*batch, dim, dim)``.
-
-    Returns:
-        Shape ``(*batch, dim, dim)``.
-
-    Raises:
-        ValueError: if a matrix of the batch is not positive definite.
-
-    Example:
-        >>> import torch
-        >>> factorise("S", 4 * torch.eye(2)).tolist()
-        [[2.0, 0.0], [0.0, 2.0]]
-    """
+    """Return the lower Cholesky factor of covariances, or say that one has none."""
     try:
         return torch.linalg.cholesky(cov)
     except RuntimeError as error:  # LinAlgError, which torch.linalg does not export by name
-        raise ValueError(
+        raise NotPositiveDefiniteError(
             f"{name} is not positive definite: a covariance is singular or holds NaN. Two sensors "
             "that read the same quantity without noise (R = 0) are such a case: give R a positive "
             "variance."
@@ -284,21 +244,7 @@ def tril_to_vector(cov: Tensor) -> Tensor:
 
 
 def without_autocast(like: Tensor) -> AbstractContextManager[None]:
-    """Keep the dtypes of tensors inside torch.autocast: half precision loses a filter's digits.
-
-    Args:
-        like: a tensor on the device that computes.
-
-    Returns:
-        A context manager that costs nothing outside torch.autocast.
-
-    Example:
-        >>> import torch
-        >>> x = torch.eye(2)
-        >>> with torch.autocast("cpu", dtype=torch.bfloat16), without_autocast(x):
-        ...     (x @ x).dtype
-        torch.float32
-    """
+    """Keep dtypes inside torch.autocast on the device of ``like``: half precision loses digits."""
     kind = like.device.type
     if kind == "meta" or not torch.is_autocast_enabled(kind):
         return nullcontext()

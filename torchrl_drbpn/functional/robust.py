@@ -58,7 +58,7 @@ def saturate_innovation(
         Readings, shape ``(*batch, obs)``; NaN and inf that arrived stay what they are.
 
     Raises:
-        ValueError: if ``gate`` is not positive and finite.
+        ValueError: if ``gate`` is not positive and finite, or for a wrong shape or dtype.
 
     Example:
         >>> import torch
@@ -76,6 +76,8 @@ def saturate_innovation(
     See also :meth:`torchrl_drbpn.BeliefFilter.step`, which takes a gate.
     """
     check_gate(gate)
+    steps = tuple(reset.shape)
+    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset)
     with without_autocast(mean):
         predicted = predict_step(model, mean, previous_action, reset)
         H = model.emission_matrix

@@ -43,15 +43,7 @@ class TransitionMLP(NamedTuple):
     activation: str
 
     def __call__(self, mean: Tensor, action: Tensor) -> Tensor:
-        """Evaluate f.
-
-        Args:
-            mean: shape ``(*batch, state)``.
-            action: shape ``(*batch, action)``.
-
-        Returns:
-            Shape ``(*batch, state)``.
-        """
+        """Return f, shape ``(*batch, state)``, of ``(*batch, state)`` and ``(*batch, action)``."""
         hidden = torch.cat([mean, action], -1)
         last = len(self.weights) - 1
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -110,47 +102,83 @@ class StateSpace:
     def __post_init__(self) -> None:
         """Check every field."""
         H, B = self.emission_matrix, self.action_matrix
-        if H.ndim != 2 or B.ndim != 2:
+        if H.ndim != 2 or B.ndim != 2 or not H.is_floating_point():
             raise ValueError(
-                "`emission_matrix` must have shape (obs, state) and `action_matrix` (obs, action), "
-                f"got {tuple(H.shape)} and {tuple(B.shape)}."
+                "`emission_matrix` must be floating point of shape (obs, state), `action_matrix` "
+                f"of shape (obs, action), got {H.dtype} {tuple(H.shape)} and {tuple(B.shape)}."
             )
         (obs, state), action = H.shape, B.shape[1]
-        wanted = [
-            ("action_matrix", B, (obs, action), None),
-            ("emission_offset", self.emission_offset, (obs,), None),
-            ("initial_mean", self.initial_mean, (state,), None),
-            ("emission_cov", self.emission_cov, (obs, obs), (obs,)),
-            ("initial_cov", self.initial_cov, (state, state), (state,)),
+        fields: list[tuple[str, Tensor, tuple[int, ...]]] = [
+            ("action_matrix", B, (obs, action)),
+            ("emission_offset", self.emission_offset, (obs,)),
+            ("initial_mean", self.initial_mean, (state,)),
+            ("emission_cov", self.emission_cov, (obs, obs)),
+            ("initial_cov", self.initial_cov, (state, state)),
         ]
         if isinstance(self.transition_cov, Tensor):
-            wanted.append(("transition_cov", self.transition_cov, (state, state), (state,)))
+            fields.append(("transition_cov", self.transition_cov, (state, state)))
         if isinstance(self.transition, TransitionMLP):
             weights, biases = self.transition.weights, self.transition.biases
-            widths = [state + action, *(len(bias) for bias in biases[:-1]), state]
             if len(weights) != len(biases):
                 raise ValueError(
                     f"`transition` must have as many biases as weights, got {len(biases)} and "
                     f"{len(weights)}."
                 )
+            widths = [state + action, *(len(bias) for bias in biases[:-1]), state]
             for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
-                wanted.append((f"transition.weights[{i}]", weights[i], (fan_out, fan_in), None))
-                wanted.append((f"transition.biases[{i}]", biases[i], (fan_out,), None))
-        dtype, device = H.dtype, H.device
-        if not dtype.is_floating_point:
-            raise ValueError(f"`emission_matrix` must be floating point, got {dtype}.")
-        for name, value, shape, other in wanted:
-            if value.shape != shape and (other is None or value.shape != other):
-                either = "" if other is None else f" or {other}, its diagonal"
+                fields.append((f"transition.weights[{i}]", weights[i], (fan_out, fan_in)))
+                fields.append((f"transition.biases[{i}]", biases[i], (fan_out,)))
+        for name, value, shape in fields:
+            diagonal = name.endswith("cov") and value.shape == shape[1:]
+            if value.shape != shape and not diagonal:
+                either = f" or {shape[1:]}, its diagonal" if name.endswith("cov") else ""
                 raise ValueError(
                     f"`{name}` must have shape {shape}{either}, got {tuple(value.shape)}: "
                     f"`emission_matrix` says (obs, state) = {(obs, state)}."
                 )
-            if value.dtype != dtype or value.device != device:
+            if value.dtype != H.dtype or value.device != H.device:
                 raise ValueError(
-                    f"`{name}` is {value.dtype} on {value.device}, `emission_matrix` {dtype} on "
-                    f"{device}: all fields must agree."
+                    f"`{name}` is {value.dtype} on {value.device}, `emission_matrix` {H.dtype} on "
+                    f"{H.device}: all fields must agree."
                 )
+
+    def check_inputs(
+        self,
+        steps: tuple[int, ...],
+        start: tuple[int, ...],
+        mean: Tensor,
+        previous_action: Tensor,
+        observation: Tensor,
+        observed: Tensor,
+        reset: Tensor,
+        use_stored_state: Tensor | None = None,
+        stored_mean: Tensor | None = None,
+    ) -> None:
+        """Raise unless ``mean`` is (*start, state), all others (*steps, n), and dtypes fit."""
+        obs, state, action = self.obs_dim, self.state_dim, self.action_dim
+        own, flag = self.emission_matrix.dtype, torch.bool
+        wanted: tuple[tuple[str, Tensor | None, torch.dtype, str, tuple[int, ...]], ...] = (
+            ("reset", reset, flag, "", steps),
+            ("observed", observed, flag, " obs", (*steps, obs)),
+            ("observation", observation, own, " obs", (*steps, obs)),
+            ("previous_action", previous_action, own, " action", (*steps, action)),
+            ("mean", mean, own, " state", (*start, state)),
+            ("use_stored_state", use_stored_state, flag, "", steps),
+            ("stored_mean", stored_mean, own, " state", (*steps, state)),
+        )
+        for name, value, dtype, word, shape in wanted:
+            if value is None or (value.shape == shape and value.dtype == dtype):
+                continue
+            hint = "Was the model built for another environment? `reset` says the batch."
+            if dtype is flag:
+                hint = "One entry for each component, or for each step: True where it is so."
+            elif value.dtype != dtype:
+                hint = "Add TorchRL's DoubleToFloat to the environment, or build with dtype=."
+            kinds = [str(x).removeprefix("torch.") for x in (dtype, value.dtype)]
+            raise ValueError(
+                f"`{name}` must be {kinds[0]} of shape (*batch,{word}) = {shape}, got {kinds[1]} "
+                f"{tuple(value.shape)}. {hint}"
+            )
 
     @property
     def obs_dim(self) -> int:
@@ -173,14 +201,7 @@ class StateSpace:
         return self.emission_cov.ndim == 1 and self.obs_dim > self.state_dim
 
     def constant_cov(self) -> Tensor:
-        """Return Q where it is one matrix for every step.
-
-        Returns:
-            Shape ``(state, state)``.
-
-        Raises:
-            ValueError: if transition_cov depends on the state.
-        """
+        """Return Q, shape ``(state, state)``; ValueError if it depends on the state."""
         if not isinstance(self.transition_cov, Tensor):
             raise ValueError(
                 "`transition_cov` depends on the state here, so the covariance depends on the "
@@ -202,9 +223,8 @@ class StateSpace:
 
     def predicted_mean(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Tensor:
         """Return f(mean, action), or m_0 where an episode starts; reset: ``(*batch, 1)``."""
-        # An episode start must not hear of what came before, not even of a NaN: the transition's
-        # weights would receive 0 * NaN.
-        mean = torch.where(reset, torch.zeros((), dtype=mean.dtype, device=mean.device), mean)
+        # A NaN before an episode start would reach the transition's weights as 0 * NaN.
+        mean = mean.masked_fill(reset, 0.0)
         return torch.where(reset, self.initial_mean, self.transition(mean, previous_action))
 
 
@@ -239,6 +259,5 @@ def predict_step(model: StateSpace, mean: Tensor, previous_action: Tensor, reset
     if isinstance(model.transition_cov, Tensor):
         cov = model.constant_cov()
     else:
-        zero = torch.zeros((), dtype=mean.dtype, device=mean.device)
-        cov = model.transition_cov(torch.where(row, zero, mean), previous_action)
+        cov = model.transition_cov(mean.masked_fill(row, 0.0), previous_action)
     return Belief(predicted, torch.where(row.unsqueeze(-1), model.full_initial_cov(), cov))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,19 +17,19 @@ from torchrl_drbpn.functional import (
     predict_step,
     saturate_innovation,
 )
-from torchrl_drbpn.functional.gaussian import without_autocast
+from torchrl_drbpn.functional.gaussian import NotPositiveDefiniteError, without_autocast
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
+    LearnedCovariance,
     LinearGaussianEmission,
     check_dim,
-    initial_covariance,
     transition_functions,
 )
 
 __all__ = ["BeliefDivergedError", "BeliefFilter"]
 
-_MAX_DEFAULT_STATE = 32
+_MAX_DEFAULT_STATE, _MIN_INITIAL_STD = 32, 1e-3
 
 
 class BeliefDivergedError(ValueError):
@@ -104,41 +105,35 @@ class BeliefFilter(nn.Module):
         super().__init__()
         if covariance != "constant":
             raise ValueError(f"`covariance` must be 'constant', got {covariance!r}.")
-        obs_dim, action_dim = check_dim("obs_dim", obs_dim), check_dim("action_dim", action_dim)
         if state_dim is None:
             given = getattr(transition, "state_dim", None) or getattr(emission, "state_dim", None)
-            state_dim = given or min(obs_dim, _MAX_DEFAULT_STATE)
-        state_dim = check_dim("state_dim", state_dim)
-        if transition is None:
-            transition = GaussianTransition(
-                state_dim,
-                action_dim,
-                residual=state_dim <= obs_dim,
-                device=device,
-                dtype=dtype,
+            state_dim = given or min(check_dim("obs_dim", obs_dim), _MAX_DEFAULT_STATE)
+        self.obs_dim = check_dim("obs_dim", obs_dim)
+        self.action_dim = check_dim("action_dim", action_dim)
+        self.state_dim = check_dim("state_dim", state_dim)
+        if not initial_std > _MIN_INITIAL_STD:
+            raise ValueError(
+                f"`initial_std` must be above its floor of {_MIN_INITIAL_STD}, got {initial_std}."
             )
-        if emission is None:
-            emission = LinearGaussianEmission(
-                obs_dim, state_dim, action_dim, device=device, dtype=dtype
-            )
-        for part, module in (("transition", transition), ("emission", emission)):
-            for name, mine in (
-                ("obs_dim", obs_dim),
-                ("action_dim", action_dim),
-                ("state_dim", state_dim),
-            ):
-                its = getattr(module, name, mine)
+        place: dict[str, Any] = {"device": device, "dtype": dtype}
+        self.transition = transition or GaussianTransition(
+            state_dim, action_dim, residual=state_dim <= obs_dim, **place
+        )
+        self.emission = emission or LinearGaussianEmission(obs_dim, state_dim, action_dim, **place)
+        for part in ("transition", "emission"):
+            for name in ("obs_dim", "action_dim", "state_dim"):
+                mine = getattr(self, name)
+                its = getattr(getattr(self, part), name, mine)
                 if its != mine:
                     raise ValueError(
                         f"`{part}` has {name}={its}, the filter {name}={mine}: build both with "
                         "the same dimensions."
                     )
-        self.obs_dim, self.action_dim, self.state_dim = obs_dim, action_dim, state_dim
         self.covariance, self.validate = covariance, validate
-        self.transition = transition
-        self.emission = emission
-        self.initial_mean = nn.Parameter(torch.zeros(state_dim, device=device, dtype=dtype))
-        self.initial_noise = initial_covariance(state_dim, initial_cov, initial_std, device, dtype)
+        self.initial_mean = nn.Parameter(torch.zeros(state_dim, **place))
+        self.initial_noise = LearnedCovariance(
+            state_dim, initial_cov, initial_std, _MIN_INITIAL_STD, name="initial_cov", **place
+        )
         self._check_model()
 
     def reset_parameters(self) -> None:
@@ -232,24 +227,18 @@ class BeliefFilter(nn.Module):
             ValueError: for a shape, a dtype, a gate or an observed value that cannot be.
         """
         del cov
-        self._check_shapes(mean, previous_action, observation, observed, reset)
-        model = self.state_space()
-        believed = observation
+        model, believed = self.state_space(), observation
         if gate is not None:
             believed = saturate_innovation(
                 model, mean, previous_action, observation, observed, reset, gate
             )
         # The error is about the readings as they arrived, not as they were moved.
-        given = (mean, previous_action, observation, observed)
-        try:
-            out = filter_step(
+        return self._filter_checked(
+            lambda: filter_step(
                 model, mean, previous_action, believed, observed, reset, return_cov=return_cov
-            )
-        except ValueError:  # a covariance network of NaN gives no covariance
-            self._check_values(None, *given)
-            raise
-        self._check_values(out, *given)
-        return out
+            ),
+            mean, previous_action, observation, observed,
+        )  # fmt: skip
 
     # ------------------------------------------------------------------ a sequence
     def forward(
@@ -288,23 +277,13 @@ class BeliefFilter(nn.Module):
             ValueError: for a shape, a dtype or an observed value that cannot be.
         """
         del cov
-        self._check_shapes(None, previous_action, observation, observed, reset)
-        if mean.shape[-1:] != (self.state_dim,) or mean.shape[:-1] != reset.shape[:-1]:
-            raise ValueError(
-                "`mean` must be the belief before the first step, of shape (*batch, state) = "
-                f"{(*reset.shape[:-1], self.state_dim)}, got {tuple(mean.shape)}."
-            )
-        given = (mean, previous_action, observation, observed)
-        try:
-            out = filter_sequence(
+        return self._filter_checked(
+            lambda: filter_sequence(
                 self.state_space(), mean, previous_action, observation, observed, reset,
                 use_stored_state=use_stored_state, stored_mean=stored_mean, return_cov=return_cov,
-            )  # fmt: skip
-        except ValueError:  # a covariance network of NaN gives no covariance
-            self._check_values(None, *given)
-            raise
-        self._check_values(out, *given)
-        return out
+            ),
+            mean, previous_action, observation, observed,
+        )  # fmt: skip
 
     def predict(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
         """Return the predicted belief, shapes as in :meth:`step`.
@@ -321,63 +300,35 @@ class BeliefFilter(nn.Module):
             return predict_step(self.state_space(), mean, previous_action, reset)
 
     # ------------------------------------------------------------------ checks
-    def _check_shapes(
+    def _filter_checked(
         self,
-        mean: Tensor | None,
-        previous_action: Tensor,
-        observation: Tensor,
-        observed: Tensor,
-        reset: Tensor,
-    ) -> None:
-        batch = tuple(reset.shape)
-        if observed.dtype is not torch.bool or observed.shape != (*batch, self.obs_dim):
-            raise ValueError(
-                f"`observed` must be bool of shape (*batch, obs) = {(*batch, self.obs_dim)}, got "
-                f"{_describe(observed)}: one entry per sensor component, True where it arrived."
-            )
-        if reset.dtype is not torch.bool:
-            raise ValueError(f"`reset` must be bool of shape (*batch,), got {_describe(reset)}.")
-        wanted = [
-            ("observation", observation, self.obs_dim, "obs"),
-            ("previous_action", previous_action, self.action_dim, "action"),
-        ]
-        if mean is not None:
-            wanted.append(("mean", mean, self.state_dim, "state"))
-        for name, value, dim, word in wanted:
-            if value.shape != (*batch, dim):
-                raise ValueError(
-                    f"`{name}` must have shape (*batch, {word}) = {(*batch, dim)}, got "
-                    f"{_describe(value)}. Was the filter built for another environment?"
-                )
-        dtype = self.initial_mean.dtype
-        for name, value, _, _ in wanted:
-            if value.dtype != dtype:
-                raise ValueError(
-                    f"`{name}` is {value.dtype}, the filter's parameters are {dtype}: add "
-                    "TorchRL's DoubleToFloat to the environment, or build the filter with dtype=."
-                )
-
-    def _check_values(
-        self,
-        out: FilterOutput | None,
+        run: Callable[[], FilterOutput],
         mean: Tensor,
         previous_action: Tensor,
         observation: Tensor,
         observed: Tensor,
-    ) -> None:
-        """Raise if the output is not finite, or there is none, and name the input that caused it.
+    ) -> FilterOutput:
+        """Filter, and raise if the result is not finite: name the input that caused it.
 
-        The mean is looked at too: where nothing was observed the likelihood is 0 whatever it is.
+        One sum tells. The mean is in it: where nothing was observed the likelihood is 0.
         """
-        if not self.validate or torch.compiler.is_compiling() or observation.is_meta:
-            return
+        silent = not self.validate or torch.compiler.is_compiling() or observation.is_meta
+        failed: NotPositiveDefiniteError | None = None
         try:
-            if out is not None and bool(
-                (out.log_likelihood.detach().sum() + out.mean.detach().sum()).isfinite()
-            ):
-                return
-        except RuntimeError:  # under vmap no number reaches the host
-            return
+            out = run()
+        except NotPositiveDefiniteError as error:  # a covariance network of NaN gives no covariance
+            if silent:
+                raise
+            failed = error
+        else:
+            if silent:
+                return out
+            total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
+            try:
+                if bool(total.isfinite()):
+                    return out
+            except RuntimeError:  # under vmap no number reaches the host
+                return out
         refuse_readings(observation, observed)
         for name, value in (("previous_action", previous_action), ("mean", mean)):
             if not bool(torch.isfinite(value).all()):
@@ -385,8 +336,8 @@ class BeliefFilter(nn.Module):
                     f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "
                     "by a policy or a filter that had diverged?"
                 )
-        if out is None:
-            return
+        if failed is not None:
+            raise failed
         raise BeliefDivergedError(
             "the belief is no longer finite although every observed entry is: the learned model "
             "diverged. Lower the learning rate, or use residual=False where state > obs."
@@ -394,15 +345,7 @@ class BeliefFilter(nn.Module):
 
 
 def refuse_readings(observation: Tensor, observed: Tensor) -> None:
-    """Raise if readings that arrived are no numbers that a filter can compute with.
-
-    Args:
-        observation: shape ``(*batch, obs)``.
-        observed: bool, the same shape.
-
-    Raises:
-        ValueError: for NaN, infinite or too large readings; says which components.
-    """
+    """Raise ValueError naming the components whose readings that arrived are no usable numbers."""
     largest = torch.finfo(observation.dtype).max ** 0.5
     for bad, what, remedy in (
         (observation.isnan(), "NaN", "mark them missing, for example with ObservedFromNaN"),
@@ -424,7 +367,3 @@ def refuse_readings(observation: Tensor, observed: Tensor) -> None:
                 f"`observation` holds {what} in entries that `observed` calls arrived "
                 f"(components {at}): {remedy}."
             )
-
-
-def _describe(value: Tensor) -> str:
-    return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"

@@ -22,7 +22,6 @@ __all__ = ["GaussianTransition", "LinearGaussianEmission"]
 
 CovKind = Literal["diag", "full"]
 Function = Callable[[Tensor, Tensor], Tensor]
-_MIN_INITIAL_STD = 1e-3
 
 
 def check_dim(name: str, value: int) -> int:
@@ -32,26 +31,23 @@ def check_dim(name: str, value: int) -> int:
     return int(value)
 
 
-def _check_std(init_std: float, min_std: float) -> None:
-    if not 0 < min_std < init_std:
-        raise ValueError(
-            f"`min_std` and `init_std` must satisfy 0 < min_std < init_std, got min_std={min_std} "
-            f"and init_std={init_std}: the floor keeps the likelihood bounded, and the start must "
-            "lie above it."
-        )
-
-
 def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}.")
 
 
-def _linear(layers: Iterable[nn.Module]) -> list[tuple[Tensor, Tensor]]:
-    """Return (weight, bias) of each linear layer."""
-    return [(layer.weight, layer.bias) for layer in layers if isinstance(layer, nn.Linear)]
+def _tensors(layers: Iterable[nn.Module]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Return the weights and the biases of linear layers."""
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    return tuple(layer.weight for layer in linear), tuple(layer.bias for layer in linear)
 
 
-class _Covariance(nn.Module):
+def _compact(raw: Tensor, kind: CovKind, min_std: float) -> Tensor:
+    """Map free numbers to the variances of a diagonal covariance, or to a full one."""
+    return positive_std(raw, min_std).square() if kind == "diag" else full_cov(raw, min_std)
+
+
+class LearnedCovariance(nn.Module):
     """A learned covariance, diagonal or full, whose standard deviations have a floor."""
 
     def __init__(
@@ -62,54 +58,39 @@ class _Covariance(nn.Module):
         min_std: float,
         device: torch.device | str | None,
         dtype: torch.dtype | None,
+        name: str = "cov",
     ) -> None:
         super().__init__()
-        _check_choice("cov", kind, ("diag", "full"))
-        _check_std(init_std, min_std)
+        _check_choice(name, kind, ("diag", "full"))
+        if not 0 < min_std < init_std:
+            raise ValueError(
+                "`min_std` and `init_std` must satisfy 0 < min_std < init_std, got "
+                f"min_std={min_std} and init_std={init_std}: the floor keeps the likelihood "
+                "bounded, and the start must lie above it."
+            )
         self.kind, self.init_std, self.min_std = kind, init_std, min_std
-        like = torch.zeros(dim, device=device, dtype=dtype)
-        if kind == "diag":
-            raw = like + inverse_softplus(like.new_tensor(init_std - min_std))
-        else:
-            spread = like.new_tensor(init_std**2 - min_std**2).sqrt()
-            raw = torch.diag_embed(like + inverse_softplus(spread))
-        self.raw = nn.Parameter(raw)
+        shape = (dim,) if kind == "diag" else (dim, dim)
+        self.raw = nn.Parameter(torch.empty(shape, device=device, dtype=dtype))
+        self.reset_parameters()
 
+    @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Put the standard deviations back to ``init_std``."""
-        raw = self.raw
-        start = _Covariance(
-            raw.shape[-1], self.kind, self.init_std, self.min_std, raw.device, raw.dtype
-        )
-        with torch.no_grad():
-            raw.copy_(start.raw)
+        """Put the standard deviations to ``init_std``."""
+        start, floor = self.init_std, self.min_std
+        if self.kind == "diag":
+            self.raw.copy_(inverse_softplus(self.raw.new_tensor(start - floor)))
+        else:
+            spread = self.raw.new_tensor(start**2 - floor**2).sqrt()
+            self.raw.copy_(torch.diag_embed(inverse_softplus(spread).expand(len(self.raw))))
 
     def compact(self) -> Tensor:
         """Return the variances (dim,) of a diagonal covariance, the matrix (dim, dim) of a full."""
-        if self.kind == "diag":
-            return positive_std(self.raw, self.min_std).square()
-        return full_cov(self.raw, self.min_std)
+        return _compact(self.raw, self.kind, self.min_std)
 
     def forward(self) -> Tensor:
         """Return the covariance, shape (dim, dim)."""
         cov = self.compact()
         return cov.diag() if self.kind == "diag" else cov
-
-
-def initial_covariance(
-    dim: int,
-    kind: CovKind,
-    init_std: float,
-    device: torch.device | str | None,
-    dtype: torch.dtype | None,
-) -> _Covariance:
-    """Make the learned covariance of the initial belief; calling it returns ``(dim, dim)``."""
-    _check_choice("initial_cov", kind, ("diag", "full"))
-    if not init_std > _MIN_INITIAL_STD:
-        raise ValueError(
-            f"`initial_std` must be above its floor of {_MIN_INITIAL_STD}, got {init_std}."
-        )
-    return _Covariance(dim, kind, init_std, _MIN_INITIAL_STD, device=device, dtype=dtype)
 
 
 class GaussianTransition(nn.Module):
@@ -173,8 +154,6 @@ class GaussianTransition(nn.Module):
         self.state_dim = check_dim("state_dim", state_dim)
         self.action_dim = check_dim("action_dim", action_dim)
         _check_choice("activation", activation, ("relu", "tanh"))
-        _check_choice("cov", cov, ("diag", "full"))
-        _check_std(init_std, min_std)
         self.residual, self.activation = residual, activation
         self.cov_kind, self.init_std, self.min_std = cov, init_std, min_std
 
@@ -186,35 +165,34 @@ class GaussianTransition(nn.Module):
 
         self.layers = network(state_dim)
         self.cov_layers: nn.ModuleList | None = None
-        self.noise: _Covariance | None = None
+        start = LearnedCovariance(state_dim, cov, init_std, min_std, device, dtype)
+        self.noise: LearnedCovariance | None = None if cov_network else start
         if cov_network:
-            self.cov_layers = network(state_dim if cov == "diag" else state_dim * state_dim)
-            self._start_from_init_std(_linear(self.cov_layers))
-        else:
-            self.noise = _Covariance(state_dim, cov, init_std, min_std, device, dtype)
+            self.cov_layers = network(start.raw.numel())
+            self._start_from_init_std()
 
-    def _start_from_init_std(self, layers: list[tuple[Tensor, Tensor]]) -> None:
+    @torch.no_grad()
+    def _start_from_init_std(self) -> None:
         """Make the network Q begin as the constant init_std: its last layer as the bias alone."""
-        weight, bias = layers[-1]
-        start = _Covariance(
-            self.state_dim, self.cov_kind, self.init_std, self.min_std, bias.device, bias.dtype
-        )
-        with torch.no_grad():
-            weight.zero_()
-            bias.copy_(start.raw.flatten())
+        weights, biases = _tensors(self.cov_layers or ())
+        start = LearnedCovariance(
+            self.state_dim, self.cov_kind, self.init_std, self.min_std, biases[-1].device,
+            biases[-1].dtype,
+        )  # fmt: skip
+        weights[-1].zero_()
+        biases[-1].copy_(start.raw.flatten())
 
     def reset_parameters(self) -> None:
         """Start again: new weights for f, the covariance from ``init_std``."""
         for module in self.modules():
-            if module is not self and isinstance(module, nn.Linear | _Covariance):
+            if isinstance(module, nn.Linear | LearnedCovariance):
                 module.reset_parameters()
         if self.cov_layers is not None:
-            self._start_from_init_std(_linear(self.cov_layers))
+            self._start_from_init_std()
 
     def mean_network(self) -> TransitionMLP:
         """Return f as tensors, as the native filter reads it."""
-        weights, biases = zip(*_linear(self.layers), strict=True)
-        return TransitionMLP(weights, biases, self.residual, self.activation)
+        return TransitionMLP(*_tensors(self.layers), self.residual, self.activation)
 
     @property
     def constant_cov(self) -> bool:
@@ -238,11 +216,11 @@ class GaussianTransition(nn.Module):
             return self.noise()
         if mean is None or action is None or self.cov_layers is None:
             raise ValueError("`mean` and `action` are needed: this Q is a network of both.")
-        weights, biases = zip(*_linear(self.cov_layers), strict=True)
-        raw = TransitionMLP(weights, biases, False, self.activation)(mean, action)
-        if self.cov_kind == "diag":
-            return torch.diag_embed(positive_std(raw, self.min_std).square())
-        return full_cov(raw.view(*raw.shape[:-1], self.state_dim, self.state_dim), self.min_std)
+        raw = TransitionMLP(*_tensors(self.cov_layers), False, self.activation)(mean, action)
+        if self.cov_kind == "full":
+            raw = raw.view(*raw.shape[:-1], self.state_dim, self.state_dim)
+        cov = _compact(raw, self.cov_kind, self.min_std)
+        return torch.diag_embed(cov) if self.cov_kind == "diag" else cov
 
     def forward(self, mean: Tensor, action: Tensor) -> Belief:
         """Return the predicted belief.
@@ -344,7 +322,7 @@ class LinearGaussianEmission(nn.Module):
             torch.zeros(obs_dim, action_dim, device=device, dtype=dtype)
         )
         self.offset = nn.Parameter(torch.zeros(obs_dim, device=device, dtype=dtype))
-        self.noise = _Covariance(obs_dim, cov, init_std, min_std, device, dtype)
+        self.noise = LearnedCovariance(obs_dim, cov, init_std, min_std, device, dtype)
 
     def reset_parameters(self) -> None:
         """Start again: H = [I 0], B and d zero, R from ``init_std``."""
