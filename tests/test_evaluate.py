@@ -168,7 +168,7 @@ def test_each_family_changes_what_the_agent_gets(drbpn: Path, tmp_path: Path) ->
     for row in late_rows:
         assert float(row["missing_ratio"]) == pytest.approx(3 / int(row["length"]))
     for wrong in ("stuck:1:20:sensor", "drift:0:1"):
-        assert mean(wrong, "missing_ratio") == pytest.approx(0.2, abs=0.06)
+        assert mean(wrong, "missing_ratio") == pytest.approx(0.4, abs=0.08)
     # What is stuck is easy to predict; what drifts is not.
     assert mean("drift:0:1", "log_likelihood") < mean("noise:0", "log_likelihood")
     # A reading that is 5 off is not what the model expects.
