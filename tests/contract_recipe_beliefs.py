@@ -6,8 +6,8 @@ import copy
 import math
 from typing import TYPE_CHECKING
 
-import agents
 import pytest
+import small_agents
 import torch
 from belief_frames import BeliefFrames
 from contract_environments import ACTION, OBS, StaircaseEnv, saved
@@ -82,14 +82,14 @@ class RecipeBeliefContract(BeliefFrames):
         )
         return TransformedEnv(StaircaseEnv(4), Compose(*transforms))
 
-    def collected(self, belief: Belief) -> tuple[agents.Agent, TensorDictBase]:
+    def collected(self, belief: Belief) -> tuple[small_agents.Agent, TensorDictBase]:
         """Return heads and a rollout whose rows begin in mid-episode, with ends of both kinds."""
         norm = MaskedObservationNorm(OBS)
         norm.update(self.make_env().rollout(40, break_when_any_done=False))
-        agent = agents.make_agent(
+        agent = small_agents.make_agent(
             belief.module, belief.feature_dim, dtype=torch.float32, actions=ACTION, norm=norm
         )
-        data = agents.collect(agent, env=self.make_env())
+        data = small_agents.collect(agent, env=self.make_env())
         norm(data["next"])
         assert data.shape == (4, 18)
         assert not data["is_init"][:, 0].all()

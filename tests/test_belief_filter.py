@@ -15,8 +15,8 @@ from typing import NamedTuple
 import oracles
 import pytest
 import torch
-from agents import make_filter
 from contracts import saved
+from small_agents import make_filter
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode

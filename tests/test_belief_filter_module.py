@@ -6,8 +6,8 @@ import functools
 
 import pytest
 import torch
-from agents import make_filter as make_any_filter
 from contracts import ACTION, OBS, BeliefModuleContract
+from small_agents import make_filter as make_any_filter
 from tensordict import TensorDict, TensorDictBase
 from torchrl.modules import set_recurrent_mode
 

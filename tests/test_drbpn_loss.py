@@ -13,7 +13,8 @@ import functools
 import oracles
 import pytest
 import torch
-from agents import (
+from contracts import LossContract
+from small_agents import (
     ACTION,
     OBS,
     TIME,
@@ -23,7 +24,6 @@ from agents import (
     make_agent,
     make_filter,
 )
-from contracts import LossContract
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import nn

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from agents import (
+from small_agents import (
     ACTION,
     ENVS,
     OBS,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from agents import make_filter
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_agents import make_filter
 from tensordict import TensorDict
 from torchrl.modules import set_recurrent_mode
 

@@ -11,7 +11,8 @@ import functools
 
 import pytest
 import torch
-from agents import (
+from particle_tools import make_filter as make_particles
+from small_agents import (
     ACTION,
     ENVS,
     GAMMA,
@@ -25,7 +26,6 @@ from agents import (
     make_filter,
     make_gae,
 )
-from particle_tools import make_filter as make_particles
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer

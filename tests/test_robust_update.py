@@ -15,7 +15,7 @@ from typing import Any
 import oracles
 import pytest
 import torch
-from agents import make_filter
+from small_agents import make_filter
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
