@@ -326,3 +326,21 @@ def test_an_mp4_without_its_package_is_refused_before_anything_is_done(
     with pytest.raises(UserError, match=r"needs imageio-ffmpeg: .* film.gif"):
         show(drbpn, tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_camera_follows_the_robot() -> None:
+    walker: Any = gymnasium.make("Walker2d-v5").unwrapped
+    walker.reset(seed=0)
+    camera = Camera("Walker2d-v5", (96, 128))
+
+    def coloured_pixels(x: float) -> int:
+        position = walker.data.qpos.copy()
+        position[0] = x
+        walker.set_state(position, walker.data.qvel)
+        try:
+            picture = camera.picture(walker).astype(float)
+        except Exception as error:  # each OpenGL back end fails in its own way
+            pytest.skip(f"nothing can be drawn here: {error}")
+        return int(((picture[..., 0] > 1.15 * picture[..., 1]) & (picture.max(-1) > 60)).sum())
+
+    assert coloured_pixels(50.0) > 0.5 * coloured_pixels(0.0) > 50

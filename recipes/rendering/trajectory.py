@@ -94,7 +94,10 @@ class Camera:
             os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed
         options: dict[str, Any] = {"render_mode": "rgb_array", "disable_env_checker": True}
         try:
-            made = gymnasium.make(env_id, width=size[0], height=size[1], **options)
+            # Gymnasium's own choice is a camera that stays where the robot started.
+            made = gymnasium.make(
+                env_id, width=size[0], height=size[1], camera_name="track", **options
+            )
         except TypeError:
             made = gymnasium.make(env_id, **options)
         made.reset(seed=0)
