@@ -444,10 +444,9 @@ def test_every_command_answers_bad_input_with_one_line_and_status_2(
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
         with pytest.raises(SystemExit) as left:
             command(name, importlib.import_module(name).run)
-        said = capsys.readouterr().err
+        (line,) = capsys.readouterr().err.splitlines()
         assert left.value.code == 2
-        assert said.splitlines()[-1].startswith(("error: `run", "error: `nowhere"))
-        assert "Traceback" not in said
+        assert line.startswith(("error: `run", "error: `nowhere"))
 
 
 def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(

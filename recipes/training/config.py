@@ -319,8 +319,9 @@ def command(name: str, run: Callable[[dict[str, Any]], int]) -> None:
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def main(config: DictConfig) -> None:
-        plain = OmegaConf.to_container(config, resolve=True)
-        if status := run(cast(dict[str, Any], plain)):
+        plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+        # Explained in here: Hydra puts a line of its own before an error that leaves its job.
+        if status := explained(lambda: run(plain), name):
             sys.exit(status)
 
     run_command(main, name)
