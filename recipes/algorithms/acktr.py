@@ -26,21 +26,10 @@ class ACKTR:
 
     The policy descends ``-E[advantage log p(action)]`` in the metric of its own Fisher matrix; the
     value descends its squared error, in the metric of a Gaussian of unit standard deviation around
-    it (Gauss-Newton). The step size of the policy follows the divergence that its last step made.
-
-    Args:
-        agent: whose parameters are changed; its belief module has none of its own.
-        loss: unused, as are ``steps`` and ``gae``: it has losses and steps of its own.
-        steps: unused.
-        gae: unused.
-        seed: of the targets drawn for the curvature.
-        desired_kl: divergence of the policy over one rollout, nats.
-        policy: arguments of :class:`~algorithms.kfac.KFAC`.
-        critic: the same, and ``steps`` a rollout.
-
-    Raises:
-        UserError: if the belief module has parameters of its own.
-        ValueError: if a number makes no sense.
+    it (Gauss-Newton). The step size of the policy follows the divergence ``desired_kl``, nats a
+    rollout, that its last step should have made. ``policy`` and ``critic`` are arguments of
+    :class:`~algorithms.kfac.KFAC`, and of the critic the ``steps`` of a rollout. What PPO needs
+    (``loss``, ``steps``, ``gae``) is not used.
     """
 
     def __init__(
@@ -79,16 +68,7 @@ class ACKTR:
         self.generator = torch.Generator().manual_seed(seed)
 
     def update(self, data: TensorDictBase, remaining: float) -> dict[str, float]:
-        """Learn from one rollout.
-
-        Args:
-            data: rollout of batch size ``(environments, time)`` with advantages.
-            remaining: unused: the divergence sets the step size.
-
-        Returns:
-            Losses before their steps, ``kl`` from the old to the new policy, the policy's gradient
-            norm and its step size.
-        """
+        """Learn from one rollout; return losses before their steps, ``kl``, and step size."""
         del remaining
         frames = data.reshape(-1)
         loss_critic = self._fit_critic(frames)

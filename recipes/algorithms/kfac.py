@@ -151,10 +151,8 @@ class KFAC(torch.optim.Optimizer):
     def observe(self, output: Tensor, score: Tensor) -> None:
         """Take the recorded pass into the running curvature; its graph stays for the loss.
 
-        Args:
-            output: of the recorded pass, shape ``(samples, out)``.
-            score: gradient of the log-density with respect to it, of targets drawn from the
-                model, same shape: ``noise / std`` for a Gaussian of mean ``output``.
+        ``score`` is the gradient of the log-density with respect to ``output``, ``(samples, out)``,
+        of targets drawn from the model: ``noise / std`` for a Gaussian of mean ``output``.
         """
         outputs = [out for _, out in self._recorded]
         scores = torch.autograd.grad(output, outputs, score, retain_graph=True)
@@ -171,17 +169,7 @@ class KFAC(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> Tensor:  # type: ignore[override]
-        """Take one step along the natural gradient of what ``grad`` holds.
-
-        Args:
-            closure: not supported.
-
-        Returns:
-            The divergence that the quadratic model predicts for ``lr s u``, nats.
-
-        Raises:
-            RuntimeError: before the first :meth:`observe`.
-        """
+        """Step along the natural gradient of what ``grad`` holds; return its predicted KL, nats."""
         del closure
         moves, product = [], torch.zeros(())
         for group in self.param_groups:

@@ -15,12 +15,7 @@ _LOG_2PI = math.log(2 * math.pi)
 
 
 def gaussian_pit(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    r"""Return the predicted probability of values under the one that occurred.
-
-    .. math:: u = \Phi\left( (x - \mu) / \sigma \right)
-
-    The probability integral transform: uniform on [0, 1] if the distributions are right.
-    """
+    """Return the predicted probability of values under the one that occurred: uniform if right."""
     return torch.special.ndtr((value - mean) / std)
 
 

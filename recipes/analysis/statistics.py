@@ -28,9 +28,7 @@ def ratio(first: Any, second: Any, axis: int = -1) -> Any:
 def probability_of_improvement(*pairs: Any, axis: int = -1) -> Any:
     """Return how often a run of one method beats one of another; mean over tasks, ties are halves.
 
-    Args:
-        pairs: of each task the sample of the one method, then that of the other.
-        axis: of the runs.
+    ``pairs``: of each task the sample of the one method, then that of the other.
     """
     tasks = zip(pairs[::2], pairs[1::2], strict=True)
     wins = [
@@ -42,12 +40,7 @@ def probability_of_improvement(*pairs: Any, axis: int = -1) -> Any:
 def interval(*samples: Any, statistic: Callable[..., Any] = interquartile_mean) -> tuple[Any, Any]:
     """Return the 95 % percentile bootstrap interval of a statistic, the same at every call.
 
-    Args:
-        samples: runs along the last axis.
-        statistic: of the samples, with the keyword ``axis``.
-
-    Returns:
-        Lower and upper end; NaN where a sample has one run only.
+    Runs are along the last axis; the ends are NaN where a sample has one run only.
     """
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
     if min(array.shape[-1] for array in arrays) < 2:

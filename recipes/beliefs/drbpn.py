@@ -36,14 +36,7 @@ class SensorVariances(nn.Module):
         self.emission = emission
 
     def forward(self, cov: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the diagonals of H P H' and of R.
-
-        Args:
-            cov: P, shape ``(*, state, state)``.
-
-        Returns:
-            Two tensors of shape ``(*, obs)``.
-        """
+        """Return the diagonals of H P H' and R, ``(*, obs)``, of P, ``(*, state, state)``."""
         H = self.emission.matrix
         variance = ((H @ cov) * H).sum(-1)
         return variance, self.emission.cov().diagonal().expand_as(variance)
@@ -79,17 +72,7 @@ def build(
     emission: Mapping[str, Any],
     initial: Mapping[str, Any],
 ) -> Belief:
-    """Build the belief filter.
-
-    Args:
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        state_dim: components of the latent state; None: as many as the observation, at most 32.
-        policy_input: what the heads read, ``mean`` or ``mean_cov``.
-        transition: arguments of ``GaussianTransition``; ``residual`` None: where state <= obs.
-        emission: arguments of ``LinearGaussianEmission``.
-        initial: arguments of the belief before the first observation.
-    """
+    """Build the belief filter, see conf/belief/drbpn.yaml."""
     state = min(obs_dim, 32) if state_dim is None else state_dim
     moves = dict(transition)
     if moves["residual"] is None:

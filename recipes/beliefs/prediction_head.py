@@ -19,12 +19,7 @@ class PredictionHead(nn.Module):
 
     .. math:: \log N(x_t^{obs}; g(h_{t-1}, a_{t-1}), \mathrm{diag}(\sigma^2))
 
-    Args:
-        hidden_size: width of the hidden state.
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        init_std: sigma at the start, normalised observation units.
-        min_std: its floor.
+    sigma starts at ``init_std`` and stays above ``min_std``, normalised observation units.
     """
 
     def __init__(
@@ -40,15 +35,7 @@ class PredictionHead(nn.Module):
         self.raw_std = nn.Parameter(inverse_softplus(torch.full((obs_dim,), init_std - min_std)))
 
     def forward(self, hidden: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Return the log-likelihood of what arrived, as predicted from the step before.
-
-        Args:
-            hidden: hidden state before the step, shape ``(*, hidden)``.
-            tensordict: with the normalised observation, ``observed`` and ``previous_action``.
-
-        Returns:
-            Shape ``(*,)``, nats; 0 where nothing arrived.
-        """
+        """Return the log-likelihood of what arrived, nats, shape ``(*,)``; 0 where nothing did."""
         observed = tensordict.get("observed")
         seen = zero_missing(tensordict.get(OBSERVATION), observed)
         mean, std = self.predict(hidden, tensordict.get("previous_action"))
@@ -57,26 +44,13 @@ class PredictionHead(nn.Module):
         return zero_missing(density, observed).sum(-1)
 
     def predict(self, hidden: Tensor, previous_action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation of the next observation.
-
-        Args:
-            hidden: hidden state before the step, shape ``(*, hidden)``.
-            previous_action: shape ``(*, action)``.
-
-        Returns:
-            g, shape ``(*, obs)``, and sigma, shape ``(obs,)``, normalised observation units.
-        """
+        """Return g, shape ``(*, obs)``, and sigma, shape ``(obs,)``, of the next observation."""
         mean = self.mean(torch.cat([hidden, previous_action], -1))
         return mean, positive_std(self.raw_std, self.min_std)
 
 
 class StoredPrediction(nn.Module):
-    """Predict the next observation from a stored state, one step at a time.
-
-    Args:
-        prediction_head: the auxiliary task.
-        hidden_of: picks the hidden state, shape ``(*, hidden)``, out of the stored one.
-    """
+    """Predict the next observation from a stored state, one step at a time."""
 
     def __init__(
         self, prediction_head: PredictionHead, hidden_of: Callable[[Tensor], Tensor]
@@ -85,16 +59,7 @@ class StoredPrediction(nn.Module):
         self.prediction_head, self.hidden_of = prediction_head, hidden_of
 
     def forward(self, state: Tensor, action: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the forecast and its covariance.
-
-        Args:
-            state: recurrent state before the step.
-            action: the one before, shape ``(*, action)``.
-            is_init: bool, shape ``(*, 1)``: an episode starts from zeros.
-
-        Returns:
-            Shapes ``(*, obs)`` and ``(*, obs, obs)``.
-        """
+        """Return the forecast, ``(*, obs)``, and its covariance; an episode starts from zeros."""
         hidden = torch.where(is_init, 0.0, self.hidden_of(state))
         mean, std = self.prediction_head.predict(hidden, action)
         return mean, torch.diag_embed(std.square().expand_as(mean))
@@ -108,11 +73,7 @@ def with_prediction(
 ) -> TensorDictSequential:
     """Make a recurrent belief write its prediction of the observation, before it reads it.
 
-    Args:
-        module: the belief as the agent uses it.
-        prediction_head: its auxiliary task.
-        state_key: where its recurrent state is read.
-        hidden_of: picks the hidden state out of that.
+    ``hidden_of`` picks the hidden state out of the recurrent one that is read at ``state_key``.
     """
     prediction = TensorDictModule(
         StoredPrediction(prediction_head, hidden_of),

@@ -19,22 +19,10 @@ _INPUT, _STATE, _STATE_C = "recurrent_input", "recurrent_state", "recurrent_stat
 class RecurrentBelief(TensorDictModuleBase):
     r"""Run a recurrent network over (what arrived, which entries did[, previous action]).
 
-    Its auxiliary task, the paper's for DR-PPO and ADR-PPO, is to predict the next observation:
-    see :class:`~beliefs.prediction_head.PredictionHead`.
-
     .. math:: h_t = \mathrm{RNN}(h_{t-1}, [x_t, m_t, a_{t-1}])
 
-    Args:
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        cell: "gru" or "lstm".
-        hidden_size: width of the hidden state, which is also the features.
-        with_action: whether the network reads the previous action (ADR-PPO).
-        init_std: sigma at the start, normalised observation units.
-        min_std: floor of sigma, normalised observation units.
-
-    Raises:
-        ValueError: for an unknown cell or a width under 1.
+    The features are h. Its auxiliary task, the paper's for DR-PPO and ADR-PPO, is to predict the
+    next observation: see :class:`~beliefs.prediction_head.PredictionHead`.
     """
 
     def __init__(

@@ -32,14 +32,9 @@ class MemoryAttention(nn.Module):
         y = \sum_{heads} W_o W_v \sum_j p_j m_j + e
 
     with a learned r_j in the place of Transformer-XL's projected sinusoids. With r = 0 it is what
-    ``nn.MultiheadAttention`` computes, in another order: W_k is applied to the query and W_v to
-    the average, so that no entry is projected again. A bias of the keys would shift all scores
-    alike and one of the values add to e: there is neither.
-
-    Args:
-        width: of the steps.
-        heads: attention heads; divides the width.
-        window: k, steps that a step attends over, itself included.
+    ``nn.MultiheadAttention`` computes, in another order: W_k is applied to the query and W_v to the
+    average, so that no entry is projected again. A bias of the keys would shift all scores alike
+    and one of the values add to e: there is neither.
     """
 
     def __init__(self, width: int, heads: int, window: int) -> None:
@@ -59,15 +54,10 @@ class MemoryAttention(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, entries: Tensor, visible: Tensor) -> Tensor:
-        """Attend from the last steps.
+        """Attend from the last steps, shape ``(rows, time, width)``.
 
-        Args:
-            entries: k - 1 remembered ones, then the steps, shape ``(rows, k - 1 + time, width)``.
-            visible: whether an entry is of the episode of a step, bool, shape
-                ``(rows, time, k - 1 + time)``.
-
-        Returns:
-            Shape ``(rows, time, width)``.
+        ``entries``: k - 1 remembered ones, then the steps, ``(rows, k - 1 + time, width)``;
+        ``visible``: whether an entry is of the episode of a step, ``(rows, time, k - 1 + time)``.
         """
         rows, time, count = visible.shape
         heads, head_dim, width = self.split
@@ -93,13 +83,10 @@ class MemoryAttention(nn.Module):
 
 
 def shifted(window: Tensor) -> Tensor:
-    """Move what each step holds of its window to where the window lies.
+    """Move what each step holds of its window, ``(*, time, k)``, to where the window lies.
 
-    Args:
-        window: of every step, oldest first, shape ``(*, time, k)``.
-
-    Returns:
-        Shape ``(*, time, k - 1 + time)``: row t holds its k values from entry t on, -inf elsewhere.
+    Row t of the result, ``(*, time, k - 1 + time)``, holds its k values from entry t on, -inf
+    elsewhere.
     """
     time, size = window.shape[-2:]
     count = size - 1 + time
@@ -109,13 +96,7 @@ def shifted(window: Tensor) -> Tensor:
 
 
 class MemoryLayer(nn.Module):
-    """A pre-norm encoder layer that attends over its own inputs at earlier steps.
-
-    Args:
-        width: of the steps.
-        heads: attention heads; divides the width.
-        window: k, steps that a step attends over, itself included.
-    """
+    """A pre-norm encoder layer that attends over its own inputs at earlier steps."""
 
     def __init__(self, width: int, heads: int, window: int) -> None:
         super().__init__()
@@ -131,16 +112,11 @@ class MemoryLayer(nn.Module):
         )
 
     def forward(self, x: Tensor, memory: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Take some steps through the layer.
+        """Return the steps' outputs, and the memory with their normalised inputs after it.
 
-        Args:
-            x: the steps, shape ``(rows, time, width)``.
-            memory: normalised inputs of the layer at the k - 1 steps before, oldest first, shape
-                ``(rows, k - 1, width)``.
-            visible: see :class:`MemoryAttention`.
-
-        Returns:
-            The steps' outputs, and the memory with their normalised inputs after it.
+        ``x`` is ``(rows, time, width)``; ``memory`` the normalised inputs of the layer at the k - 1
+        steps before, oldest first, ``(rows, k - 1, width)``; ``visible`` as in
+        :class:`MemoryAttention`.
         """
         entries = torch.cat([memory, self.norm(x)], 1)
         x = x + self.attention(entries, visible)
@@ -156,23 +132,10 @@ class TransformerBelief(TensorDictModuleBase):
     several layers the features so depend on the last ``layers * (k - 1) + 1`` steps.
 
     The recurrent state is the memory: normalised inputs of every layer, half of what keys and
-    values would take, and what the current weights make keys and values of. No gradient flows
-    into it. A step seen alone and the same step seen in a sequence give the same features, however
-    the rollout was cut, as long as the parameters stay. The features are the output of the last
-    layer; the auxiliary task is that of the recurrent networks.
-
-    Args:
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        window: k, steps that a layer attends over, this one included.
-        width: of tokens and features.
-        heads: attention heads; divides the width.
-        layers: how many.
-        init_std: of the predicted observation at the start, normalised observation units.
-        min_std: its floor.
-
-    Raises:
-        ValueError: for sizes that do not fit.
+    values would take, and what the current weights make keys and values of. No gradient flows into
+    it. A step seen alone and the same step seen in a sequence give the same features, however the
+    rollout was cut, as long as the parameters stay. The features are the output of the last layer;
+    the auxiliary task is that of the recurrent networks.
     """
 
     def __init__(
@@ -269,10 +232,8 @@ class TransformerBelief(TensorDictModuleBase):
     def _attend(self, x: Tensor, memory: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
         """Return features (rows, time, width) and the memory after each step.
 
-        Args:
-            x: embedded steps, shape ``(rows, time, width)``.
-            memory: before the first of them, shape ``(rows, layers, k - 1, width)``.
-            start: where the episode of each began, shape ``(rows, time)``.
+        ``memory`` is that before the first, ``(rows, layers, k - 1, width)``; ``start`` where the
+        episode of each step began, ``(rows, time)``.
         """
         # The entries by the step they belong to; which are outside the window the layers know.
         entry = torch.arange(1 - self.window, x.shape[1], device=x.device)

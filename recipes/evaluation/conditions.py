@@ -26,13 +26,9 @@ _SELECTIONS = ("model", "random")
 class Condition:
     """What an agent is evaluated under; what it does not name stays as in training.
 
-    Attributes:
-        name: in full, such as ``outages:0.5:20:sensor``: it reads back to the same condition.
-        family: the part before the first colon.
-        missingness: which entries do not arrive.
-        noise: what is added to those that do.
-        ratio: share of the sensors that is taken away for good.
-        selection: ``model`` or ``random``, which sensors stay; empty: all.
+    ``name`` reads back to the same condition; ``family`` is its part before the first colon. A
+    ``ratio`` of the sensors is taken away for good, by ``selection``: model, random, or empty
+    (none).
     """
 
     name: str
@@ -65,13 +61,8 @@ class Condition:
 def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Condition:
     """Read a condition such as ``mcar:0.5``, see conf/evaluate.yaml.
 
-    Args:
-        text: the condition.
-        settings: configuration of the run: what the text does not name stays.
-        spike_std: deviation of spikes where the text gives none, raw units.
-
-    Raises:
-        UserError: if the text can't be read.
+    What the text does not name stays as in ``settings``, the configuration of the run;
+    ``spike_std`` is the deviation of spikes where the text gives none, raw units.
     """
     missing, noise = settings.missingness, settings.noise
     match text.split(":"):
@@ -153,10 +144,9 @@ def default_conditions(
 ) -> list[str]:
     """Return the conditions of an evaluation that names none, as text.
 
-    Args:
-        levels: ``grid`` of conf/evaluate.yaml. Ratio 0 is the same in every family: once.
-        full: whether to go beyond MCAR, MAR and sensor reduction.
-        model: whether the agent has a model that can choose sensors.
+    ``levels`` is ``grid`` of conf/evaluate.yaml (ratio 0, the same in every family, counts once),
+    ``full`` whether to go beyond MCAR, MAR and sensor reduction, ``model`` whether the agent has a
+    model that can choose sensors.
     """
     ratios = [ratio for ratio in levels["ratios"] if ratio > 0]
     out = ["none:0"] if len(ratios) < len(levels["ratios"]) else []
@@ -189,9 +179,6 @@ def removed_sensors(
     The order in which an episode loses sensors is drawn from ``reduction_seed`` and its number
     alone, so that every agent of a task meets the same choices, and those of a smaller ratio are
     among those of a larger one. By the agent's model, one choice holds for every episode.
-
-    Raises:
-        UserError: if the model is to choose and there is none.
     """
     if not condition.selection:
         return None

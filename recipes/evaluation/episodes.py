@@ -133,15 +133,10 @@ def run_episodes(
     at every step: its row is not simulated, the policy sees its last observation again and again,
     and a belief that went on with that could leave the range of its numbers.
 
-    Args:
-        policy: belief module and policy head.
-        make_env: builds the environment of the block of this number, batch size ``(BLOCK,)``.
-        episodes: how many.
-        mode: ``sampled`` actions or ``mean`` actions.
-        seed: of episodes, corruption and sampled actions.
-        watch: called after every step with the episodes of the block, the stepped tensordict of
-            these, and whether each was still running before the step, ``(episodes of the block,)``.
-        stop: asked at every step; if it returns True the episodes are given up: False comes back.
+    ``make_env`` builds the environment of the block of a number, batch size ``(BLOCK,)``. ``watch``
+    is called after every step with the episodes of the block, the stepped tensordict of these, and
+    whether each was still running before the step. ``stop`` is asked at every step: where it
+    returns True the episodes are given up, and False comes back.
     """
     with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(_KINDS[mode]):
         for block, first in enumerate(range(0, episodes, BLOCK)):

@@ -12,14 +12,10 @@ from training.errors import UserError
 
 
 def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
-    """Return run folders, each once, sorted.
+    """Return run folders, each once, sorted, by their names or patterns.
 
-    Args:
-        wanted: folders or patterns; a folder that exists is no pattern, whatever its name holds. A
-            pattern gives the folders with a config.yaml.
-
-    Raises:
-        UserError: if there is none, or one that is named does not exist.
+    A folder that exists is no pattern, whatever its name holds. A pattern gives the folders with a
+    config.yaml.
     """
     found: list[Path] = []
     for text in [wanted] if isinstance(wanted, str) else wanted or []:

@@ -25,15 +25,9 @@ from torchrl_drbpn import BeliefFilterModule, select_sensors
 class SensorModel:
     """What a trained belief has learned about its sensors, float64.
 
-    Attributes:
-        names: of the sensors.
-        seed: of the training.
-        emission_matrix: H, shape ``(obs, state)``.
-        predicted_cov: P = Q, shape ``(state, state)``.
-        emission_cov: R, shape ``(obs, obs)``.
-        added_std: standard deviation of the noise that the sensors did have in training, spikes
-            included, in the units of R's, shape ``(obs,)``; R should hold it, and what the model
-            can't explain.
+    H ``(obs, state)``, P = Q ``(state, state)``, R ``(obs, obs)``. ``added_std``: deviations of the
+    noise that the sensors did have in training, spikes included, in the units of R's; R should hold
+    it, and what the model can't explain.
     """
 
     names: list[str]
@@ -50,27 +44,21 @@ class SensorModel:
         return H @ self.predicted_cov @ H.mT + self.emission_cov
 
     def ranking(self, criterion: Literal["D", "A"]) -> Tensor:
-        """Return all sensors, best first, shape ``(obs,)``.
+        """Return all sensors, best first, by information ("D") or by the variance left ("A").
 
-        Args:
-            criterion: "D": information; "A": the variance left in what the sensors would read
-                without noise, tr H P+ H', which no choice of the state's units changes.
+        The latter is that of what the sensors would read without noise, tr H P+ H', which no choice
+        of the state's units changes.
         """
         H, P, R = self.emission_matrix, self.predicted_cov, self.emission_cov
         target = H if criterion == "A" else None
         return select_sensors(H, P, R, len(self.names), criterion=criterion, target=target).indices
 
     def along(self, orders: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return the information of the first k sensors of an order, and what they leave.
+        """Return the information of the first k sensors of an order, and what they leave.
 
         With L L' the covariance of the readings in that order, and N N' that of their noise, the
-        readings up to k hold sum_{i <= k} log(L_ii / N_ii) nats on the state.
-
-        Args:
-            orders: indices of sensors, shape ``(*batch, count)``.
-
-        Returns:
-            Information, nats, and the share of tr H P H' that is left, both ``(*batch, count)``.
+        readings up to k hold sum_{i <= k} log(L_ii / N_ii) nats on the state; the share of tr H P
+        H' that is left comes with it, both of the shape of ``orders``, ``(*batch, count)``.
         """
         pairs = orders.unsqueeze(-1), orders.unsqueeze(-2)
         readings = torch.linalg.cholesky(self.observation_cov[pairs])
@@ -84,11 +72,7 @@ class SensorModel:
 
 
 def learned_sensors(trained: TrainedAgent) -> SensorModel:
-    """Read H, P and R from a trained belief filter.
-
-    Raises:
-        UserError: if the belief has no H, P and R, or no P that holds at every step.
-    """
+    """Read H, P and R from a trained belief filter; refuse a belief that has none."""
     name, module = trained.settings.belief.get("name"), trained.agent.belief
     if not isinstance(module, BeliefFilterModule):
         raise UserError(

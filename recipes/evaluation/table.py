@@ -45,9 +45,8 @@ class Protocol:
 class Table:
     """One row an episode, as text; what the file holds is kept unless ``overwrite`` begins anew.
 
-    Raises:
-        UserError: if the file can't be continued: it is of another kind, of other settings, or
-            of another agent or checkpoint than ``agents``, by the names of their run folders.
+    A file of another kind, of other settings, or of another agent or checkpoint than ``agents``, by
+    the names of their run folders, is refused.
     """
 
     def __init__(
@@ -123,11 +122,7 @@ def evaluate_condition(
     *,
     run: str = "",
 ) -> Rows:
-    """Evaluate an agent, of the run folder of a name, under a condition.
-
-    Returns:
-        One row an episode and kind of action (``modes``); None where a column does not apply.
-    """
+    """Evaluate an agent under a condition: one row an episode and kind of action (``modes``)."""
     episodes, policy = protocol.episodes, StoppingPolicy(trained.agent)
     removed = removed_sensors(
         condition, trained, episodes=episodes, reduction_seed=protocol.reduction_seed

@@ -32,14 +32,7 @@ WEIGHTS = "agent.safetensors"  # of an agent that was saved by itself
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """An agent, ready to act.
-
-    Attributes:
-        settings: configuration of the run.
-        agent: with the trained weights.
-        frames: environment steps that it was trained for.
-        gate: see :func:`load_trained_agent`.
-    """
+    """An agent, ready to act: configuration of its run, weights, environment steps, gate."""
 
     settings: DictConfig
     agent: Agent
@@ -90,11 +83,8 @@ class TrainedAgent:
     ) -> Callable[[int], TransformedEnv]:
         """Return what builds the environment of a block of episodes, like the training ones.
 
-        Args:
-            missingness: what does not arrive; None: as in training.
-            noise: what is added to what arrives; None: as in training.
-            removed: components that never arrive, bool of shape ``(episodes, obs)``; None: none.
-            complete: whether to write ``complete_observation``, normalised alike.
+        What is None stays as in training; ``removed``, bool of shape ``(episodes, obs)``, never
+        arrives. ``complete``: whether to write ``complete_observation``, normalised alike.
         """
         changed = self.settings.copy()
         changed.missingness = missingness or changed.missingness
@@ -120,15 +110,12 @@ class TrainedAgent:
 
 
 def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
-    """Read the last checkpoint of a run, or an agent that was saved by itself.
+    """Read the last checkpoint of a run, or an agent that recipes/save_agent.py saved.
 
     Args:
-        folder: the run folder, or one of ``recipes/save_agent.py``.
+        folder: of either.
         gate: standard deviations of the innovation, beyond which a reading counts as if at that
             distance; None: every reading is believed.
-
-    Raises:
-        UserError: if the folder or the checkpoint can't be used, or the gate is refused.
     """
     config, weights = load_config(folder), folder / WEIGHTS
     with closing(make_env(config, num_envs=1)) as env:

@@ -21,16 +21,8 @@ def evaluate_training(
 ) -> list[dict[str, Any]] | None:
     """Evaluate the agent of a run as it is now; nothing of the training changes.
 
-    Args:
-        config: of the run.
-        training: the run.
-        kind: ``training`` or ``final``.
-        episodes: of each kind of action.
-        stop: asked at every step; if it returns True the evaluation is given up.
-
-    Returns:
-        A row for each kind of action, see :data:`training.run_folder.EVALUATION_COLUMNS`; None
-        where it was given up.
+    Returns a row for each kind of action (:data:`training.run_folder.EVALUATION_COLUMNS`), or None
+    where ``stop``, asked at every step, gave the evaluation up.
     """
     make_env = TrainedAgent(config, training.agent, training.frames).environments()
     rows = []

@@ -35,19 +35,11 @@ _FAR = 0.9999  # depth of what is not there, 1 at the far end of the scene
 class Recording:
     """Part of an episode, step by step; sensor values in normalised units, ``(time, obs)`` each.
 
-    Attributes:
-        kind: what ``estimate`` is: the sensor's value by what arrived until this step, the reading
-            predicted from the step before, or nothing.
-        task: Gymnasium id.
-        names: of the sensor components.
-        first_step: of the episode that is in here.
-        pictures: of the robot at each step; empty where it can't be drawn.
-        complete: what complete, noiseless sensors would have shown.
-        arrived: what arrived, 0 where nothing did.
-        observed: bool, True where something arrived.
-        estimate: of every sensor by the belief; NaN where it has none.
-        std: its standard deviation, of the belief filter the root of the diagonal of H P H'; NaN
-            where the belief has none.
+    ``complete`` is what complete, noiseless sensors would have shown; ``arrived`` holds 0 where
+    nothing did. ``estimate`` is, by ``kind``, each sensor's value by what arrived until this step,
+    the reading predicted from the step before, or NaN; ``std`` its deviation (of the filter the
+    root of the diagonal of H P H'), or NaN. ``pictures`` of the robot are empty where it can't be
+    drawn.
     """
 
     kind: Kind
@@ -84,9 +76,7 @@ class Recording:
 class Camera:
     """Draw the state of a simulator by Gymnasium's ``rgb_array``, in a twin that is put into it.
 
-    Args:
-        env_id: the task.
-        size: width and height of a picture, pixels; tasks without such arguments draw their own.
+    ``size``: width and height in pixels; tasks without such arguments draw their own.
     """
 
     def __init__(self, env_id: str, size: tuple[int, int]) -> None:
@@ -104,11 +94,7 @@ class Camera:
         self.twin: Any = made.unwrapped
 
     def picture(self, simulator: Any) -> Picture:
-        """Return a picture ``(height, width, 3)`` of an unwrapped environment of the same task.
-
-        Raises:
-            RuntimeError: if its state can't be set, or nothing is drawn on this machine.
-        """
+        """Return a picture ``(height, width, 3)`` of an unwrapped environment of the same task."""
         if hasattr(simulator, "data") and hasattr(self.twin, "set_state"):
             self.twin.set_state(simulator.data.qpos, simulator.data.qvel)
             picture = np.array(self.twin.render())
@@ -135,21 +121,9 @@ def record_episode(
 ) -> Recording:
     """Let a trained agent act and record what it saw, missed and believed.
 
-    The episode is the first of an evaluation with the same seed. If nothing can be drawn, a printed
-    line says why.
-
-    Args:
-        trained: the agent.
-        condition: what does not arrive or is wrong.
-        removed: of :func:`evaluation.conditions.removed_sensors`.
-        mode: ``sampled`` actions or ``mean`` actions.
-        seed: of the episode, the corruption and sampled actions.
-        start: steps of the episode to leave out.
-        steps: steps to keep; fewer where the episode ends before.
-        picture_size: width and height of the robot's pictures, pixels; None: no pictures.
-
-    Raises:
-        UserError: if the episode is over before ``start``.
+    The episode is the first of an evaluation with the same seed; the ``steps`` from ``start`` on
+    are kept, fewer where it ends before. If nothing can be drawn, a printed line says why; without
+    ``picture_size`` (width and height in pixels) there are no pictures.
     """
     # States are read from Gymnasium's simulators, whatever the agent was trained on.
     local = trained.settings.copy()

@@ -50,16 +50,8 @@ def robot_size(width: int) -> tuple[int, int]:
 class Film(Sequence[Picture]):
     """Frames of an episode, each drawn when it is asked for.
 
-    The panels are drawn once, over the whole recording; a frame shows the window of steps up to its
-    own.
-
-    Args:
-        recording: of an episode.
-        sensors: indices of the sensors that get a panel.
-        steps: indices into the recording, one a frame.
-        window: steps that a panel looks back.
-        width: pixels.
-        title: in the first line.
+    The panels, of the ``sensors``, are drawn once, over the whole recording; a frame, one for each
+    index of the recording in ``steps``, shows the ``window`` of steps up to its own.
     """
 
     def __init__(

@@ -45,16 +45,12 @@ class Agent(nn.Module):
 
     A critic may see more than the policy, as it is left behind after training (asymmetric
     actor-critic, [Pinto et al. 2018]). It reads the complete observation beside the features, not
-    in their place: the value of a policy that acts on a belief depends on that belief, and a
-    critic without it is biased [Baisero and Amato 2022].
-
-    Args:
-        norm: standardises observations; learns by ``norm.update(rollout)`` alone.
-        belief: the belief module and what belongs to it.
-        actor: the policy head, a distribution over actions given ``features``.
-        critic: the value head, ``state_value`` given ``features`` and perhaps more.
+    in their place: the value of a policy that acts on a belief depends on that belief, and a critic
+    without it is biased [Baisero and Amato 2022].
 
     Attributes:
+        norm: standardises observations; learns by ``norm.update(rollout)`` alone.
+        belief, actor, critic: the belief module, ``features`` to actions, and to ``state_value``.
         policy: normalisation, belief module, policy head.
         summary: numbers of the belief worth a column of metrics.csv.
         observing: makes the belief module that also writes what it knows of the sensors; None.
@@ -82,14 +78,7 @@ class Agent(nn.Module):
         return get_primers_from_module(self.belief, warn=False) is not None
 
     def value(self, tensordict: TensorDictBase) -> torch.Tensor:
-        """Return V of the beliefs that are stored in a rollout.
-
-        Args:
-            tensordict: with what the critic reads, any shape.
-
-        Returns:
-            Values, shape ``(*, 1)``.
-        """
+        """Return V of the beliefs that are stored in a rollout, shape ``(*, 1)``."""
         return self.critic.module(*(tensordict.get(key) for key in self.critic.in_keys))
 
     @torch.no_grad()
@@ -102,12 +91,7 @@ class Agent(nn.Module):
         batched step gives every belief at once: no second pass over time. Of ``data["next"]`` it
         gives the beliefs that follow, truncated and terminal steps included.
 
-        Args:
-            tensordict: a rollout or its ``"next"``, normalised, any shape.
-            where: bool of that shape; the steps to value. None: all.
-
-        Returns:
-            Values, shape ``(*, 1)``; with ``where`` shape ``(count, 1)``.
+        Of all steps, shape ``(*, 1)``, or of those of the mask ``where``, shape ``(count, 1)``.
         """
         keys = (*self.belief.in_keys, *self.critic.in_keys)
         read = tensordict.select(*keys, strict=False)
@@ -117,11 +101,7 @@ class Agent(nn.Module):
 
 
 def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
-    """Build an agent, with weights from torch's global generator.
-
-    Raises:
-        UserError: if a part refuses its settings.
-    """
+    """Build an agent, with weights from torch's global generator."""
     obs_dim = env.observation_spec["observation"].shape[-1]
     action_dim = env.action_spec.shape[-1]
     norm = build(
@@ -142,14 +122,7 @@ def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
 
 
 def load_agent(folder: Path, config: DictConfig, env: TransformedEnv) -> tuple[Agent, int]:
-    """Build the agent of a run with the weights of its last checkpoint.
-
-    Returns:
-        The agent, and the environment steps it was trained for.
-
-    Raises:
-        UserError: if the checkpoint can't be used.
-    """
+    """Build the agent of a run with the weights of its last checkpoint; return its frames too."""
     path = last_checkpoint(folder)
     state = load_checkpoint(path)
     agent = make_agent(config, env)
@@ -178,22 +151,7 @@ def make_heads(
     value_gain: float,
     log_std: float,
 ) -> tuple[ProbabilisticActor, ValueOperator]:
-    """Build policy and value networks side by side.
-
-    Args:
-        feature_dim: components of ``features``.
-        obs_dim: components of an observation.
-        action_dim: components of an action.
-        critic_input: ``features``, or ``complete`` for the complete observation beside them.
-        hidden: units of the tanh layers.
-        hidden_gain: of their orthogonal weights.
-        policy_gain: of the policy's last layer.
-        value_gain: of the value's last layer.
-        log_std: log of the action's standard deviation at the start.
-
-    Raises:
-        ValueError: for another ``critic_input``.
-    """
+    """Build policy and value networks side by side, see conf/heads/mlp.yaml."""
     if critic_input not in ("features", "complete"):
         raise ValueError(f"`critic_input` must be features or complete, got {critic_input!r}.")
     scale = AddStateIndependentNormalScale(action_dim)

@@ -23,16 +23,10 @@ _NAME = re.compile(r"frames_\d{12}\.pt")
 
 
 def save_checkpoint(folder: Path, frames: int, state: dict[str, Any], *, keep: int) -> Path:
-    """Write a checkpoint whole or not at all, with its SHA-256 beside it; drop the oldest ones.
+    """Write a checkpoint whole or not at all, with its SHA-256 beside it; keep the latest few.
 
-    Args:
-        folder: the run folder.
-        frames: environment steps so far; names the file.
-        state: tensors, numbers, texts, and containers of them.
-        keep: how many of the latest checkpoints stay.
-
-    Raises:
-        UserError: if it can't be written; those before it are left alone.
+    ``state``: tensors, numbers, texts, and containers of them. If it can't be written, those before
+    it are left alone.
     """
     directory = folder / "checkpoints"
     path = directory / f"frames_{frames:012d}.pt"
@@ -76,11 +70,7 @@ def _digest(path: Path) -> str:
 
 
 def last_checkpoint(folder: Path) -> Path:
-    """Return the latest checkpoint of a run.
-
-    Raises:
-        UserError: if there is none.
-    """
+    """Return the latest checkpoint of a run."""
     if not folder.is_dir():
         raise UserError(f"`{folder}` must be a run folder; there is no such folder.")
     found = _checkpoints(folder)
@@ -93,24 +83,13 @@ def last_checkpoint(folder: Path) -> Path:
 
 
 def checkpoint_frames(folder: Path) -> int | None:
-    """Return the environment steps of the latest checkpoint of a run.
-
-    Returns:
-        Steps, or None where there is no checkpoint.
-    """
+    """Return the environment steps of the latest checkpoint of a run; None where there is none."""
     found = _checkpoints(folder)
     return int(found[-1].stem.removeprefix("frames_")) if found else None
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint, after its sums have been checked.
-
-    Returns:
-        What was given to :func:`save_checkpoint`.
-
-    Raises:
-        UserError: if the file is damaged, or of another kind; it names the one before it.
-    """
+    """Read a checkpoint, its sums checked first; a damaged one names the one before it."""
     if not path.is_file():
         raise UserError(f"`{path}` must be a checkpoint; there is no such file.")
     reason = _damage(path)
@@ -155,14 +134,7 @@ def _damage(path: Path) -> str | None:
 
 @contextmanager
 def fitting(source: str) -> Iterator[None]:
-    """Turn what a state of another task, belief or size raises into one line.
-
-    Args:
-        source: where the state came from.
-
-    Raises:
-        UserError: in the place of what was raised.
-    """
+    """Turn what a state of another task, belief or size raises into one line."""
     try:
         yield
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
@@ -177,20 +149,11 @@ def fitting(source: str) -> Iterator[None]:
 
 
 def carry_over(collector: Collector) -> dict[str, Any]:
-    """Return the step from which the next rollout goes on.
-
-    Args:
-        collector: between two rollouts.
-    """
+    """Return the step from which the next rollout goes on."""
     return collector._carrier.to_dict()
 
 
 def set_carry_over(collector: Collector, state: dict[str, Any]) -> None:
-    """Let the next rollout go on from a saved step.
-
-    Args:
-        collector: of an environment whose simulators are in the same state.
-        state: from :func:`carry_over`.
-    """
+    """Let the next rollout go on from a saved step of simulators in the same state."""
     batch_size = collector._carrier.batch_size
     collector._carrier = TensorDict.from_dict(state, batch_size=batch_size)

@@ -47,11 +47,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
 
 
 def composed_config(overrides: Sequence[str] = (), name: str = "config") -> DictConfig:
-    """Compose and check the configuration that a command line gives, outside a Hydra job.
-
-    Raises:
-        UserError: if conf/ has no such group or key, or a value makes no sense.
-    """
+    """Compose and check the configuration that a command line gives, outside a Hydra job."""
     try:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             config = hydra.compose(name, list(overrides))
@@ -63,9 +59,7 @@ def composed_config(overrides: Sequence[str] = (), name: str = "config") -> Dict
 def choice(group: str, name: str, **values: Any) -> DictConfig:
     """Return an entry of a config group, such as ``choice("missingness", "mcar", eta=0.5)``.
 
-    Returns:
-        The entry, with other values for some of its keys. It may refer to other groups: put it
-        into the configuration of a run.
+    It may refer to other groups: put it into the configuration of a run.
     """
     node = cast(DictConfig, OmegaConf.load(CONF / group / f"{name}.yaml"))
     for key, value in values.items():
@@ -78,17 +72,8 @@ def choice(group: str, name: str, **values: Any) -> DictConfig:
 def build(name: str, node: Any, *args: Any, **kwargs: Any) -> Any:
     """Build what a node of the configuration names; what it refuses is one line for the user.
 
-    Args:
-        name: of the node, for the error.
-        node: with a ``_target_``; ``name`` in it is a label and not handed on.
-        args: of the target.
-        kwargs: of the target, beside those of the node.
-
-    Returns:
-        What the target returns.
-
-    Raises:
-        UserError: if there is no such target, or it refuses its arguments.
+    ``name`` is the node's, for the error; arguments are the target's, beside those of the node,
+    whose own ``name`` is a label and not handed on.
     """
     plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
     if not isinstance(plain, dict) or "_target_" not in plain:
@@ -109,15 +94,8 @@ def build(name: str, node: Any, *args: Any, **kwargs: Any) -> Any:
 def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
     """Check types against those of the defaults, limits, and what must go together.
 
-    Args:
-        config: composed; whole floats in the place of integers are made integers.
-        overrides: the words it was composed from; Hydra must be initialised.
-
-    Returns:
-        The same configuration.
-
-    Raises:
-        UserError: if a value makes no sense.
+    Whole floats in the place of integers are made integers. ``overrides`` are the words that the
+    configuration was composed from; Hydra must be initialised.
     """
     groups = [word for word in overrides if (CONF / word.split("=")[0].lstrip("+~")).is_dir()]
     defaults = hydra.compose("config", groups)
@@ -198,15 +176,7 @@ def check_mode(mode: str) -> None:
 
 
 def missingness_kind(node: Mapping[str, Any]) -> str:
-    """Return what makes entries go missing, by a node of conf/missingness.
-
-    Args:
-        node: ``missingness`` of a run.
-
-    Returns:
-        ``none``, ``mcar``, ``mar``, ``nmar``, ``outages``, ``delay``, ``multi_rate``, or the name
-        of somebody's own target.
-    """
+    """Return what makes entries go missing: ``none``, ``mar``, ``outages``, or one's own target."""
     for kind, key in (("delay", "delay"), ("multi_rate", "period")):
         if key in node and "group_by" in node:
             return kind
@@ -218,14 +188,7 @@ def missingness_kind(node: Mapping[str, Any]) -> str:
 
 
 def missingness_name(node: Mapping[str, Any]) -> str:
-    """Return missingness as a condition, such as ``mcar:0.5`` or ``outages:0.5:20:sensor``.
-
-    Args:
-        node: ``missingness`` of a run.
-
-    Returns:
-        Text that recipes/evaluate.py reads back.
-    """
+    """Return missingness as a condition that recipes/evaluate.py reads, such as ``mcar:0.5``."""
     kind = missingness_kind(node)
     if kind == "outages":
         return f"outages:{node['eta']:g}:{node['mean_length']:g}:{node['group_by']}"
@@ -240,14 +203,7 @@ def missingness_name(node: Mapping[str, Any]) -> str:
 
 
 def faults_name(node: Mapping[str, Any]) -> str:
-    """Return what is wrong with readings beside white noise, as conditions, `` spikes:0.05:5``.
-
-    Args:
-        node: ``noise`` of a run.
-
-    Returns:
-        A blank and text that recipes/evaluate.py reads back, for each; empty for none.
-    """
+    """Return what is wrong with readings beside white noise, such as `` spikes:0.05:5``."""
     text = ""
     if node.get("spike_probability"):
         text += f" spikes:{node['spike_probability']:g}:{node['spike_std']:g}"
@@ -268,14 +224,7 @@ def _run_folder(resume: str | None, env: str, version: str | None, belief: str, 
 
 
 def new_folder(name: str) -> str:
-    """Make a folder in runs/ that nobody has.
-
-    Args:
-        name: what its name begins with; the time follows.
-
-    Returns:
-        The folder.
-    """
+    """Make a folder in runs/ that nobody has; the time follows the name."""
     now = datetime.datetime.now().strftime("%Y-%m-%d-%H-%M-%S")
     for number in range(1, 10_000):
         path = Path("runs") / f"{name}-{now}{f'-{number}' if number > 1 else ''}"
@@ -294,12 +243,7 @@ OmegaConf.register_new_resolver("run_folder", _run_folder, use_cache=True, repla
 
 
 def run_command(main: Callable[[], None], name: str = "config") -> None:
-    """Run a command of recipes/; leave with status 2 and one line where the user can mend it.
-
-    Args:
-        main: decorated by ``hydra.main``.
-        name: of its file in conf/.
-    """
+    """Run a command of recipes/; leave with status 2 and one line where the user can mend it."""
     # Hydra hands errors on instead of printing them; where the user wants tracebacks, we do too.
     wanted = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -310,12 +254,7 @@ def run_command(main: Callable[[], None], name: str = "config") -> None:
 
 
 def command(name: str, run: Callable[[dict[str, Any]], int]) -> None:
-    """Run a recipe on what Hydra composes from a file of conf/, as plain containers.
-
-    Args:
-        name: of the file.
-        run: the recipe; returns an exit status.
-    """
+    """Run a recipe on what Hydra composes from a file of conf/, as plain containers."""
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def main(config: DictConfig) -> None:
@@ -335,15 +274,7 @@ def expected() -> tuple[type[Exception], ...]:
 
 
 def explained(job: Callable[[], int | None], name: str = "config") -> int:
-    """Run a job; turn what the user can mend into one line on standard error.
-
-    Args:
-        job: returns an exit status, or None for 0.
-        name: of its file in conf/.
-
-    Returns:
-        The job's status, or 2 for an error of the user's.
-    """
+    """Run a job; turn what the user can mend into one line on standard error, and status 2."""
     try:
         return job() or 0
     except expected() as error:
@@ -355,15 +286,7 @@ def explained(job: Callable[[], int | None], name: str = "config") -> int:
 
 
 def explain(error: BaseException, file: str = "config") -> str:
-    """Turn an error into one line; an unknown name gets the nearest one that there is.
-
-    Args:
-        error: of Hydra, or our own.
-        file: of conf/, whose names there are.
-
-    Returns:
-        The line.
-    """
+    """Turn an error into one line; an unknown name gets the nearest one that conf/ has."""
     text = str(error)
     if found := re.search(
         r"Could not (?:override|append to config\. An item is .*?|delete.*?) ?'([^']+)'", text

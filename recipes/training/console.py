@@ -44,11 +44,8 @@ class StopRequest:
 
     The first signal is remembered and nothing else happens, so that the run stops where its state
     is whole: after the update of the current rollout. A second one ends the process as usual. One
-    inside another hands its signal on to it; a cell of a sweep also stops with its sweep, which
-    may be another process.
-
-    Args:
-        file: made when the signal comes, for those that look for it.
+    inside another hands its signal on to it; a cell of a sweep also stops with its sweep, which may
+    be another process: ``file`` is made when the signal comes, for those that look for it.
     """
 
     innermost: ClassVar[StopRequest | None] = None

@@ -38,22 +38,17 @@ def make_env(
     transforms: Mapping[str, Transform] | None = None,
     complete: bool | None = None,
 ) -> TransformedEnv:
-    """Build the batched, corrupted environment of a run.
+    """Build the batched, corrupted environment of a run, batch size ``(num_envs,)``.
+
+    The recurrent state's primer is not in it: :func:`training.agent.add_primers` appends it.
 
     Args:
-        config: of the run.
-        num_envs: simulators in the batch; None: as in training.
-        seed: of episodes and corruption; None: the run's.
+        config: of the run; the simulators and the seed are its own unless given.
+        num_envs: simulators in the batch.
+        seed: of episodes and corruption.
         transforms: by their names in ``config.transforms``, in the place of what stands there.
         complete: whether to write ``complete_observation``, what complete, noiseless sensors would
             have shown; None: where the critic reads it.
-
-    Returns:
-        The environment, batch size ``(num_envs,)``. The recurrent state's primer is not in it:
-        :func:`training.agent.add_primers` appends it.
-
-    Raises:
-        UserError: if the environment does not exist or has unsuitable actions or observations.
     """
     own = {} if num_envs is None else {"num_envs": num_envs}
     base: EnvBase = build("env", config.env, **own)
@@ -90,22 +85,7 @@ def make_simulators(
     backend: str,
     kwargs: Mapping[str, Any],
 ) -> EnvBase:
-    """Build many simulators of a Gymnasium task.
-
-    Args:
-        id: Gymnasium's, without the version where ``version`` holds it.
-        version: such as ``v5``, or None.
-        num_envs: how many.
-        num_threads: threads that step them; results do not depend on it.
-        backend: ``gymnasium`` or ``envpool``.
-        kwargs: of the task.
-
-    Returns:
-        The environment.
-
-    Raises:
-        UserError: if it does not exist or has unsuitable actions or observations.
-    """
+    """Build many simulators of a Gymnasium task, see conf/env/gym.yaml."""
     backends = {"gymnasium": GymnasiumBatchEnv, "envpool": EnvPoolBatchEnv}
     if backend not in backends:
         raise UserError(f"`env.backend` must be gymnasium or envpool, got {backend!r}.")
@@ -117,11 +97,7 @@ def make_simulators(
 
 
 def env_name(config: DictConfig) -> str:
-    """Return the whole Gymnasium id of a run's task, such as ``Walker2d-v5``.
-
-    Args:
-        config: of the run.
-    """
+    """Return the whole Gymnasium id of a run's task, such as ``Walker2d-v5``."""
     env = config.env
     return f"{env.id}-{env.version}" if env.version else str(env.id)
 
@@ -142,21 +118,7 @@ def make_noise(
 ) -> list[Transform]:
     """Make what is wrong with the entries that arrive: drift, noise, spikes, then what is stuck.
 
-    Args:
-        sigma: standard deviation of white noise in units of ``scale``.
-        scale: raw simulator units.
-        spike_probability: of a large error, an entry and step.
-        spike_std: standard deviation of that error, raw simulator units.
-        stuck_probability: that a sensor gets stuck at its last value, a step.
-        stuck_mean_length: of the time that it is stuck, steps; None: to the end of the episode.
-        drift_std: of a step of the random walk of a bias, raw simulator units.
-        drift_rate: of the bias's ramp, raw simulator units a step.
-        group_by: what gets stuck together: ``sensor``, ``joint`` or ``kind``.
-        id: task whose sensors have names to group by.
-        version: of the task.
-
-    Returns:
-        The transforms, none where nothing is wrong.
+    See conf/noise for the arguments.
     """
     made: list[Transform] = []
     if drift_std != 0 or drift_rate != 0:
@@ -180,18 +142,9 @@ def make_outages(
     version: str | None,
     state_key: str | None = None,
 ) -> SensorOutages:
-    """Make sensors fail for a while, alone or together.
+    """Make sensors fail for a while, alone or together, see conf/missingness/outages.yaml.
 
-    Args:
-        eta: long-run share of the steps that a sensor is off.
-        mean_length: of an outage, steps.
-        group_by: what fails together: ``sensor``, ``joint`` or ``kind``.
-        id: task whose sensors have names to group by.
-        version: of the task.
-        state_key: where which of them work is kept; two in one environment need two.
-
-    Returns:
-        The transform.
+    ``state_key`` is where it is kept which of them work; two in one environment need two.
     """
     groups = sensor_groups(named_sensors(id, version), group_by)
     return SensorOutages(eta, mean_length, groups=groups, state_key=state_key)
@@ -206,22 +159,7 @@ def make_delay(
     id: str,
     version: str | None,
 ) -> ObservationDelay:
-    """Make readings arrive late.
-
-    Args:
-        delay: steps.
-        max_delay: of delays that are drawn for every reading; None: all are as late.
-        in_order: whether to drop readings that arrive after one taken later.
-        group_by: what travels in one packet: ``sensor``, ``joint`` or ``kind``.
-        id: task whose sensors have names to group by.
-        version: of the task.
-
-    Returns:
-        The transform.
-
-    Raises:
-        UserError: if the task's episodes end before anything can arrive.
-    """
+    """Make readings arrive late, see conf/missingness/delay.yaml."""
     groups = sensor_groups(named_sensors(id, version), group_by)
     made = ObservationDelay(delay, max_delay=max_delay, in_order=in_order, groups=groups)
     task = gymnasium.registry.get(f"{id}-{version}" if version else id)
@@ -237,18 +175,7 @@ def make_delay(
 def make_multi_rate(
     *, period: int, phase: int | None, group_by: str, id: str, version: str | None
 ) -> ObservationMultiRate:
-    """Make sensors deliver now and then.
-
-    Args:
-        period: steps from one reading to the next.
-        phase: step of the first reading; None: drawn for every group and episode.
-        group_by: what delivers together: ``sensor``, ``joint`` or ``kind``.
-        id: task whose sensors have names to group by.
-        version: of the task.
-
-    Returns:
-        The transform.
-    """
+    """Make sensors deliver now and then, see conf/missingness/multi_rate.yaml."""
     groups = sensor_groups(named_sensors(id, version), group_by)
     return ObservationMultiRate(period, phase="random" if phase is None else phase, groups=groups)
 
@@ -256,17 +183,7 @@ def make_multi_rate(
 def make_collector(
     env: TransformedEnv, policy: TensorDictModuleBase, *, num_envs: int, steps_per_env: int
 ) -> Collector:
-    """Make TorchRL's collector of one rollout after the other.
-
-    Args:
-        env: batch size ``(num_envs,)``.
-        policy: what acts.
-        num_envs: simulators.
-        steps_per_env: of a rollout.
-
-    Returns:
-        The collector.
-    """
+    """Make TorchRL's collector of one rollout after the other."""
     return Collector(
         env,
         policy,

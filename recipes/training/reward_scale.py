@@ -18,11 +18,8 @@ from torchrl_drbpn.functional.running_moments import (
 class ReturnStatistics(NamedTuple):
     """Hold what is remembered from one rollout to the next; ``_asdict()`` goes into a checkpoint.
 
-    Attributes:
-        n: discounted returns seen, shape ``(1,)``, float64.
-        mean: their mean, shape ``(1,)``, reward units.
-        var: their variance, shape ``(1,)``, squared reward units.
-        discounted: the discounted return of the episodes that go on, shape ``(environments, 1)``.
+    Count, mean and variance of the discounted returns seen, float64 ``(1,)``, and those of the
+    episodes that go on, ``(environments, 1)``.
     """
 
     n: Tensor
@@ -32,11 +29,7 @@ class ReturnStatistics(NamedTuple):
 
     @classmethod
     def start(cls, environments: int) -> ReturnStatistics:
-        """Return those of a run that begins.
-
-        Args:
-            environments: rows of every rollout.
-        """
+        """Return those of a run that begins."""
         zero = torch.zeros(1, dtype=torch.float64)
         return cls(zero, zero, zero, torch.zeros(environments, 1))
 
@@ -51,28 +44,15 @@ def scale_reward(
     clip: float = 10.0,
     eps: float = 1e-8,
 ) -> tuple[Tensor, ReturnStatistics]:
-    r"""Divide the rewards of a rollout by the running deviation of the discounted return.
+    """Divide the rewards of a rollout by the running deviation of the discounted return.
 
     With R_t = gamma R_{t-1} + r_t, R = 0 at the start of an episode, and var the variance of every
     R up to the end of this rollout: scaled = clip(r / sqrt(var + eps), -clip, clip). One scale for
     the whole rollout. The mean is not subtracted: that would change which policy is best. Reward
     scaling of [Engstrom et al. 2020, Implementation matters in deep policy gradients].
 
-    Args:
-        reward: shape ``(environments, time, 1)``.
-        done: bool of that shape, True where an episode ended.
-        statistics: those of the rollouts before.
-
-    Keyword Args:
-        gamma: discount of the return, the agent's own.
-        clip: largest magnitude of a scaled reward.
-        eps: added to the variance, squared reward units.
-
-    Returns:
-        The scaled rewards, and the statistics with this rollout in them.
-
-    Raises:
-        ValueError: a reward is NaN or infinite.
+    Returns the scaled rewards, ``(environments, time, 1)``, and the statistics with this rollout in
+    them.
     """
     if not bool(reward.isfinite().all()):
         raise ValueError(

@@ -53,12 +53,7 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV file whole or not at all.
-
-    Args:
-        path: the file.
-        rows: its rows, at least one, all with the same keys.
-    """
+    """Write a CSV file whole or not at all; all rows have the same keys."""
     write_whole(path, _csv_text(list(rows[0]), rows))
 
 
@@ -73,13 +68,8 @@ def _csv_text(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
 class Table:
     """Append rows to a CSV file; a resumed run goes on where its checkpoint was.
 
-    Args:
-        path: the file.
-        columns: its columns; the first is ``frames``.
-        up_to_frames: rows after this many frames are dropped; None: nothing is there yet.
-
-    Raises:
-        UserError: if what is there is no such table.
+    The first column is ``frames``: rows after ``up_to_frames`` are dropped; None: nothing is there
+    yet.
     """
 
     def __init__(self, path: Path, columns: Sequence[str], up_to_frames: int | None = None) -> None:
@@ -106,11 +96,7 @@ class Table:
                 yield {c: row.get(c, "") for c in self.columns}
 
     def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Append rows.
-
-        Args:
-            rows: values by column; an absent one or None is an empty cell, others are left out.
-        """
+        """Append rows; an absent value or None is an empty cell, others are left out."""
         with self.path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self.columns, lineterminator="\n")
             writer.writerows({c: row.get(c) for c in self.columns} for row in rows)
@@ -134,11 +120,7 @@ def is_evaluated(folder: Path, config: DictConfig) -> bool:
 
 
 def load_config(folder: Path) -> DictConfig:
-    """Read the configuration of a run, to build its parts anew.
-
-    Raises:
-        UserError: if there is none, or it can't be read.
-    """
+    """Read the configuration of a run, to build its parts anew."""
     path = folder / "config.yaml"
     if not path.is_file():
         raise UserError(f"`{folder}` must be a run folder with config.yaml; there is none.")
@@ -157,14 +139,7 @@ def load_config(folder: Path) -> DictConfig:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read the configuration of a run, for tables.
-
-    Returns:
-        The configuration, resolved, as plain containers.
-
-    Raises:
-        UserError: if there is none, or it can't be read.
-    """
+    """Read the configuration of a run for tables: resolved, as plain containers."""
     return cast(dict[str, Any], OmegaConf.to_container(load_config(folder), resolve=True))
 
 
@@ -176,14 +151,8 @@ def resumed_config(composed: DictConfig, overrides: Sequence[str], folder: Path)
 
     Args:
         composed: the configuration that the command line gives.
-        overrides: the words of the command line, such as ``total_frames=2_000_000``.
+        overrides: the words of the command line; any that would change the run is refused.
         folder: the run folder.
-
-    Returns:
-        The folder's configuration with the overrides that are allowed.
-
-    Raises:
-        UserError: if the folder is no run folder, or another setting was given.
     """
     config = load_config(folder)
     for word in overrides:
@@ -241,11 +210,7 @@ def _git(*arguments: str) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make a folder and keep every other run out of it until the end.
-
-    Raises:
-        UserError: if another run is in it, or it can't be written.
-    """
+    """Make a folder and keep every other run out of it until the end."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = (folder / ".lock").open("w")
@@ -274,24 +239,12 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def metric_columns(more: Iterable[str]) -> list[str]:
-    """Return the columns of metrics.csv, frames first, times last.
-
-    Args:
-        more: those that the belief adds.
-    """
+    """Return the columns of metrics.csv, frames first, those of the belief, times last."""
     return [*_METRICS, *more, "steps_per_second", "wall_time"]
 
 
 class RunLog:
-    """Tables and logger of a run.
-
-    Args:
-        folder: the run folder.
-        config: of the run.
-        columns: of metrics.csv beside the usual ones.
-        frames: at which it goes on; None: it starts.
-        evaluated_frames: of its last evaluation.
-    """
+    """Tables and logger of a run; ``frames`` at which it goes on, None where it starts."""
 
     def __init__(
         self,
@@ -308,12 +261,7 @@ class RunLog:
         self.evaluations = Table(folder / "evaluation.csv", EVALUATION_COLUMNS, evaluated_frames)
 
     def rollout(self, row: Mapping[str, Any], finished: Sequence[Mapping[str, Any]]) -> None:
-        """Log a rollout.
-
-        Args:
-            row: its numbers by column.
-            finished: a row for each episode that ended in it.
-        """
+        """Log a rollout: its numbers by column, and a row for each episode that ended in it."""
         self.metrics.append([row])
         self.episodes.append(finished)
         self._scalars("train", row)

@@ -14,9 +14,7 @@ from training.errors import UserError
 def named_sensors(task: str, version: str | None) -> list[str]:
     """Return the names of a task's sensors; none where the task has no table here.
 
-    Args:
-        task: Gymnasium id such as ``Walker2d``, or ``Walker2d-v5`` where ``version`` is None.
-        version: such as ``v5``.
+    The id is ``Walker2d``, or ``Walker2d-v5`` where ``version`` is None.
     """
     if version is None:
         task, _, version = task.rpartition("-")
@@ -24,19 +22,7 @@ def named_sensors(task: str, version: str | None) -> list[str]:
 
 
 def sensor_names(task: str, version: str | None, obs_dim: int) -> list[str]:
-    """Return a name for each component of an observation.
-
-    Args:
-        task: see :func:`named_sensors`.
-        version: such as ``v5``.
-        obs_dim: components of an observation.
-
-    Returns:
-        ``obs_dim`` different names; ``component 0`` and so on for a task that has no table here.
-
-    Raises:
-        UserError: if the task has a table and it is of another length.
-    """
+    """Return ``obs_dim`` different names; ``component 0`` and so on without a table."""
     names = named_sensors(task, version) or [f"component {i}" for i in range(obs_dim)]
     if len(names) != obs_dim:
         raise UserError(
@@ -175,19 +161,11 @@ _KINDS = (
 
 
 def sensor_groups(names: Sequence[str], by: str) -> list[list[int]] | None:
-    """Return what fails together.
+    """Return what fails together: indices in the order of their first; None for ``sensor``.
 
-    Args:
-        names: of the components, see :func:`training.sensors.sensor_names`.
-        by: ``sensor``: each component by itself; ``joint``: all that is measured at one joint or
-            body, such as angle and velocity; ``kind``: all positions and angles, all velocities,
-            all forces, all inertias.
-
-    Returns:
-        Lists of indices in the order of their first, each component in one; None for ``sensor``.
-
-    Raises:
-        UserError: if ``by`` is none of these, or the task's components have no names to go by.
+    ``by`` is ``sensor``: each component by itself; ``joint``: all that is measured at one joint or
+    body, such as angle and velocity; ``kind``: all positions and angles, all velocities, all
+    forces, all inertias.
     """
     if by == "sensor":
         return None
@@ -207,11 +185,7 @@ def sensor_groups(names: Sequence[str], by: str) -> list[list[int]] | None:
 
 
 def have_names(names: Sequence[str]) -> bool:
-    """Return whether sensors have names by which they can be grouped.
-
-    Args:
-        names: of the components, see :func:`training.sensors.sensor_names`.
-    """
+    """Return whether sensors have names by which they can be grouped."""
     return not any(name.startswith("component ") for name in names)
 
 

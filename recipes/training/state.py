@@ -38,19 +38,8 @@ class Algorithm(Protocol):
 class Training:
     """The parts of a run and its counters.
 
-    Attributes:
-        env: that of the collector.
-        agent: what is trained.
-        collector: collects rollouts by the agent's policy.
-        gae: estimates advantages.
-        algorithm: learns from rollouts.
-        scale_reward: see :func:`training.reward_scale.scale_reward`.
-        reward_statistics: what it remembers.
-        frames: environment steps so far.
-        episodes: finished episodes so far.
-        returns: raw returns of the latest finished episodes.
-        seconds: time in collection and update.
-        evaluated_frames: frames at the last evaluation; -1 before the first one.
+    ``returns``: raw, of the latest finished episodes; ``seconds``: in collection and update;
+    ``evaluated_frames``: at the last evaluation, -1 before the first one.
     """
 
     env: TransformedEnv
@@ -69,11 +58,7 @@ class Training:
     def state_dict(self, *, simulators: bool = True) -> dict[str, Any]:
         """Return everything that a checkpoint holds, between two rollouts.
 
-        Args:
-            simulators: whether their state is worth keeping; not where they have failed.
-
-        Returns:
-            Tensors, numbers, texts, and containers of them.
+        ``simulators``: whether their state is worth keeping; not where they have failed.
         """
         keeps = simulators and self.env.base_env.supports_state
         return {
@@ -95,14 +80,9 @@ class Training:
         }
 
     def load_state_dict(self, state: dict[str, Any], source: str) -> None:
-        """Put a run back to where a checkpoint was written.
+        """Put a run back to where a checkpoint of a run with the same settings was written.
 
-        Args:
-            state: from :meth:`state_dict` of a run with the same settings.
-            source: where it came from, for the error.
-
-        Raises:
-            UserError: if it belongs to another run: another task, another belief, other sizes.
+        ``source``: where it came from, for the error of a state that belongs to another run.
         """
         with fitting(source):
             self.agent.load_state_dict(state["agent"])
