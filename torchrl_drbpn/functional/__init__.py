@@ -55,6 +55,12 @@ from torchrl_drbpn.functional.particles import (
 )
 from torchrl_drbpn.functional.robust import saturate_innovation
 from torchrl_drbpn.functional.sensor_selection import SensorSelection, select_sensors
+from torchrl_drbpn.functional.smoothing import (
+    Forecast,
+    forecast,
+    row_jacobian,
+    smooth_sequence,
+)
 from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP, predict_step
 
 __all__ = [
@@ -62,6 +68,7 @@ __all__ = [
     "Consistency",
     "DiagonalGaussian",
     "FilterOutput",
+    "Forecast",
     "MissingnessMechanism",
     "OutageRates",
     "ParticleModel",
@@ -80,6 +87,7 @@ __all__ = [
     "filter_sequence",
     "filter_step",
     "filtered_cov",
+    "forecast",
     "full_cov",
     "innovation",
     "inverse_softplus",
@@ -98,6 +106,7 @@ __all__ = [
     "predict",
     "predict_step",
     "resample",
+    "row_jacobian",
     "sample_delay",
     "sample_fault_steps",
     "sample_mask",
@@ -106,6 +115,7 @@ __all__ = [
     "sample_working",
     "saturate_innovation",
     "select_sensors",
+    "smooth_sequence",
     "systematic_ancestors",
     "tril_to_vector",
     "update",

@@ -11,11 +11,14 @@ from torch import Tensor, nn
 from torchrl_drbpn.functional import (
     Belief,
     FilterOutput,
+    Forecast,
     StateSpace,
     filter_sequence,
     filter_step,
+    forecast,
     predict_step,
     saturate_innovation,
+    smooth_sequence,
 )
 from torchrl_drbpn.functional.gaussian import NotPositiveDefiniteError, without_autocast
 from torchrl_drbpn.modules.state_space import (
@@ -298,6 +301,34 @@ class BeliefFilter(nn.Module):
         """
         with without_autocast(mean):
             return predict_step(self.state_space(), mean, previous_action, reset)
+
+    # ------------------------------------------------------------------ offline
+    def smooth(
+        self,
+        mean: Tensor,
+        cov: Tensor | None,
+        previous_action: Tensor,
+        observation: Tensor,
+        observed: Tensor,
+        reset: Tensor,
+        **options: Any,
+    ) -> Belief:
+        """Return the beliefs given the whole sequence.
+
+        Arguments as of :meth:`forward`, options as of
+        :func:`~torchrl_drbpn.functional.smooth_sequence`.
+        """
+        if self.validate:
+            refuse_readings(observation, observed)
+        return smooth_sequence(
+            self.state_space(), mean, cov, previous_action, observation, observed, reset, **options
+        )
+
+    def forecast(
+        self, mean: Tensor, cov: Tensor | None, action: Tensor, **options: Any
+    ) -> Forecast:
+        """Predict the steps ahead; see :func:`~torchrl_drbpn.functional.forecast`."""
+        return forecast(self.state_space(), mean, cov, action, **options)
 
     # ------------------------------------------------------------------ checks
     def _filter_checked(

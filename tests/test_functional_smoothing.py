@@ -1,0 +1,311 @@
+"""The smoother and the forecast.
+
+Specified here: on a linear system the smoothed beliefs are those of one joint Gaussian of all
+states and readings, in values and in gradients, and those of statsmodels; on another they are the
+textbook recursion with the row-wise Jacobian, or with the one given. No episode start is crossed.
+A forecast is what the smoother says of steps without a reading behind the last.
+"""
+
+from __future__ import annotations
+
+import math
+
+import oracles
+import pytest
+import torch
+from filter_problems import Problem, assert_equal
+from torch import Tensor
+
+from torchrl_drbpn import BeliefFilter
+from torchrl_drbpn.functional import (
+    Belief,
+    StateSpace,
+    filter_sequence,
+    forecast,
+    row_jacobian,
+    smooth_sequence,
+)
+
+
+def space(system: oracles.LinearSystem) -> StateSpace:
+    return StateSpace(
+        system.transition, system.transition_cov, system.matrix, system.noise, system.action_matrix,
+        system.bias, system.initial_mean, system.initial_cov,
+    )  # fmt: skip
+
+
+def linear(
+    time: int = 7, *, batch: int = 3, reset_rate: float = 0.3, seed: int = 0
+) -> tuple[oracles.LinearSystem, oracles.Data]:
+    system = oracles.random_system(3, 4, seed=seed, full_noise=True)
+    data = oracles.simulate(system, batch, time, seed=seed, reset_rate=reset_rate)
+    data.reset[:, 0] = True
+    return system, data
+
+
+def inputs(data: oracles.Data, rows: slice = slice(None), steps: slice = slice(None)) -> list:
+    sequence = (data.previous_action, data.observation, data.observed, data.reset)
+    return [data.start_mean[rows], None, *(x[rows, steps] for x in sequence)]
+
+
+def joint_posterior(system: oracles.LinearSystem, data: oracles.Data, row: int) -> Belief:
+    """All states of a row given all its readings, by conditioning one joint Gaussian."""
+    time, s = data.reset.shape[1], system.state_dim
+    means, blocks = [], {}
+    eye = torch.eye(s, dtype=torch.float64)
+    for t in range(time):
+        if data.reset[row, t]:
+            mean, F, Q = system.initial_mean, 0 * eye, system.initial_cov
+        else:
+            mean = system.transition(means[-1], data.previous_action[row, t])
+            F, Q = system.dynamics, system.transition_cov
+        means.append(mean)
+        for j in range(t):
+            blocks[t, j] = F @ blocks[t - 1, j]
+            blocks[j, t] = blocks[t, j].mT
+        blocks[t, t] = (F @ blocks[t - 1, t - 1] @ F.mT if t else 0) + Q
+    steps = range(time)
+    prior = torch.cat([torch.cat([blocks[i, j] for j in steps], 1) for i in steps])
+    seen = data.observed[row].flatten()
+    H = torch.block_diag(*[system.matrix] * time)[seen]
+    R = torch.block_diag(*[system.noise] * time)[seen][:, seen]
+    offset = system.offset(data.previous_action[row]).flatten()[seen]
+    mean = torch.cat(means)
+    gain = torch.linalg.solve(H @ prior @ H.mT + R, H @ prior).mT
+    mean = mean + gain @ (data.observation[row].flatten()[seen] - offset - H @ mean)
+    cov = (prior - gain @ H @ prior).reshape(time, s, time, s)
+    return Belief(mean.reshape(time, s), torch.stack([cov[t, :, t] for t in steps]))
+
+
+def test_it_is_the_joint_gaussian_conditioned_on_all_readings_with_its_gradients():
+    system, data = linear()
+    leaves = {
+        "dynamics": system.dynamics, "matrix": system.matrix, "bias": system.bias,
+        "control": system.control, "initial_mean": system.initial_mean,
+        "noise": torch.linalg.cholesky(system.noise),
+        "transition_cov": torch.linalg.cholesky(system.transition_cov),
+        "initial_cov": torch.linalg.cholesky(system.initial_cov),
+    }  # fmt: skip
+    leaves = {name: value.clone().requires_grad_() for name, value in leaves.items()}
+    roots = ("noise", "transition_cov", "initial_cov")
+    fields = {n: v @ v.mT if n in roots else v for n, v in leaves.items()}
+    system = oracles.replace(system, **fields)
+    found = smooth_sequence(space(system), *inputs(data))
+    truth = [joint_posterior(system, data, row) for row in range(3)]
+    truth = Belief(*(torch.stack(part) for part in zip(*truth, strict=True)))
+    weight = torch.randn(truth.cov.shape, dtype=torch.float64)
+    gradients = []
+    for belief in (found, truth):
+        total = (belief.cov * weight).sum() + belief.mean.square().sum()
+        gradients.append(torch.autograd.grad(total, list(leaves.values()), retain_graph=True))
+    for a, b in zip(found, truth, strict=True):
+        assert_equal(a, b)
+    for name, a, b in zip(leaves, *gradients, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-8, rtol=1e-8, msg=lambda m, n=name: f"{n}: {m}")
+
+
+def test_it_equals_statsmodels():
+    statespace = pytest.importorskip("statsmodels.tsa.statespace.kalman_smoother")
+    system, data = linear(30, batch=1, reset_rate=0.0, seed=4)
+    x, observed, action = data.observation[0], data.observed[0], data.previous_action[0]
+    theirs = statespace.KalmanSmoother(k_endog=4, k_states=3)
+    theirs.bind(torch.where(observed, x, torch.nan).numpy())
+    theirs["design"], theirs["obs_cov"] = system.matrix.numpy(), system.noise.numpy()
+    theirs["obs_intercept"] = system.offset(action).T.numpy()
+    theirs["transition"], theirs["selection"] = system.dynamics.numpy(), torch.eye(3).numpy()
+    moves = torch.cat([action[1:] @ system.control.T, torch.zeros(1, 3).double()])
+    theirs["state_intercept"], theirs["state_cov"] = moves.T.numpy(), system.transition_cov.numpy()
+    theirs.initialize_known(system.initial_mean.numpy(), system.initial_cov.numpy())
+    truth = theirs.smooth()
+    mean, cov = smooth_sequence(space(system), *inputs(data))
+    assert_equal(mean[0], torch.from_numpy(truth.smoothed_state.T.copy()), 1e-8)
+    assert_equal(cov[0].movedim(0, -1), torch.from_numpy(truth.smoothed_state_cov), 1e-8)
+
+
+def test_an_episode_start_inside_equals_two_sequences():
+    system, data = linear(8, reset_rate=0.0)
+    data.reset[:, 5] = True
+    data.previous_action[:, 5] = 0
+    whole = smooth_sequence(space(system), *inputs(data))
+    parts = [
+        smooth_sequence(space(system), *inputs(data, steps=s)) for s in (slice(5), slice(5, 8))
+    ]
+    for name in ("mean", "cov"):
+        pieces = torch.cat([getattr(part, name) for part in parts], 1)
+        assert_equal(getattr(whole, name), pieces, 1e-13)
+
+
+def textbook(problem: Problem, row: int, jacobian: Tensor | None) -> list[tuple[Tensor, Tensor]]:
+    """§9.1 [Särkkä 2013] for one row, step by step; F from torch.autograd unless given."""
+    q, p, r = problem.covs()
+    leaf, model = problem.leaves, problem.model()
+    weights, biases = problem.network()
+    f = oracles.mean_network(weights, biases, problem.residual, problem.activation)
+    noise = r if problem.full_noise else torch.diag(r)
+    m, P, steps = leaf["start_mean"][row], torch.zeros_like(q), []
+    for t in range(problem.reset.shape[1]):
+        a = leaf["previous_action"][row, t]
+        F = jacobian
+        if F is None:
+            F = torch.autograd.functional.jacobian(lambda s, a=a: f(s, a), m, create_graph=True)
+        first = bool(problem.reset[row, t])
+        mp, Pp = (leaf["initial_mean"], p) if first else (f(m, a), F @ P @ F.mT + q)
+        m, P = oracles.update(
+            mp, Pp, leaf["observation"][row, t], problem.observed[row, t], leaf["matrix"], noise,
+            model.offset(a),
+        )  # fmt: skip
+        steps.append((m, P, mp, Pp, F, first))
+    out = [(m, P)]
+    for t in range(len(steps) - 2, -1, -1):
+        m, P = steps[t][:2]
+        _, _, mp, Pp, F, first = steps[t + 1]
+        if not first:
+            G = P @ F.mT @ torch.linalg.inv(Pp)
+            m, P = m + G @ (out[-1][0] - mp), P + G @ (out[-1][1] - Pp) @ G.mT
+        out.append((m, P))
+    return out[::-1]
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["row-wise", "given"])
+def test_a_network_is_smoothed_as_the_textbook_extends_it(given):
+    problem = Problem(3, 4, batch=2, time=6)
+    jacobian = 0.5 * torch.eye(3, dtype=torch.float64) if given else None
+    start, action, x, observed, reset = problem.arguments()
+    found = smooth_sequence(
+        problem.model(), start, None, action, x, observed, reset, jacobian=jacobian
+    )
+    rows = [textbook(problem, row, jacobian) for row in range(2)]
+    mean = torch.stack([torch.stack([m for m, _ in row]) for row in rows])
+    cov = torch.stack([torch.stack([P for _, P in row]) for row in rows])
+    assert_equal(found.mean, mean)
+    assert_equal(found.cov, cov)
+    mine, theirs = (problem.gradients(out) for out in (tuple(found), (mean, cov)))
+    for name, value in theirs.items():
+        torch.testing.assert_close(
+            mine[name], value, atol=1e-8, rtol=1e-8, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+def test_a_reading_of_huge_noise_is_a_missing_one_and_r_per_step_is_r():
+    system, data = linear()
+    model, everywhere = space(system), torch.ones_like(data.observed)
+    R = system.noise.expand(*data.reset.shape, 4, 4).clone()
+    same = smooth_sequence(model, *inputs(data), emission_cov=R)
+    masked = smooth_sequence(model, *inputs(data))
+    assert torch.equal(same.mean, masked.mean)
+    data.observed[1, 2] = False
+    expected = smooth_sequence(model, *inputs(data))
+    data.observed[1, 2] = everywhere[1, 2]
+    R[1, 2] = 1e12 * torch.eye(4)
+    found = smooth_sequence(model, *inputs(data), emission_cov=R)
+    assert_equal(found.mean, expected.mean, 1e-9)
+    assert_equal(found.cov, expected.cov, 1e-9)
+
+
+def test_a_nan_under_a_false_mask_or_before_an_episode_start_changes_nothing():
+    system, data = linear()
+    expected = smooth_sequence(space(system), *inputs(data))
+    arguments = inputs(data)
+    arguments[0] = torch.full_like(arguments[0], math.nan)
+    arguments[1] = torch.full((3, 3, 3), math.nan, dtype=torch.float64)
+    arguments[3] = torch.where(data.observed, data.observation, math.nan)
+    found = smooth_sequence(space(system), *arguments)
+    assert torch.equal(found.mean, expected.mean)
+    assert torch.equal(found.cov, expected.cov)
+
+
+def test_float32_covariances_stay_positive_definite_at_the_noise_floor():
+    system, data = linear(300, batch=1, reset_rate=0.0)
+    system = oracles.replace(system, noise=1e-4 * torch.eye(4)).to(torch.float32)
+    single = [x.float() if x is not None and x.is_floating_point() else x for x in inputs(data)]
+    cov = smooth_sequence(space(system), *single).cov
+    assert cov.dtype == torch.float32
+    assert bool((torch.linalg.cholesky_ex(cov)[1] == 0).all())
+
+
+# ---------------------------------------------------------------------------------- forecasts
+def test_a_forecast_is_what_the_smoother_says_of_steps_without_readings():
+    problem = Problem(3, 4, batch=2, time=6, resets=False)
+    start, action, x, observed, reset = problem.arguments()
+    cov = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    ahead = forecast(problem.model(), start, cov, action)
+    nothing = torch.zeros_like(observed)
+    smoothed = smooth_sequence(problem.model(), start, cov, action, x, nothing, reset)
+    for a, b in zip(ahead.state, smoothed, strict=True):
+        assert_equal(a, b)
+    H, R = problem.model().emission_matrix, problem.model().full_emission_cov()
+    assert_equal(ahead.observation.mean, smoothed.mean @ H.mT + problem.model().offset(action))
+    assert_equal(ahead.observation.cov, H @ smoothed.cov @ H.mT + R)
+
+
+def test_many_futures_of_a_linear_system_have_the_mean_and_covariance_of_its_forecast():
+    system = oracles.random_system(3, 4, seed=2)
+    action = torch.randn(5, 2, dtype=torch.float64)
+    mean, cov = system.initial_mean, system.initial_cov
+    ahead = forecast(space(system), mean, cov, action)
+    g = torch.Generator().manual_seed(0)
+
+    def noise(cov: Tensor) -> Tensor:
+        root = torch.linalg.cholesky(cov)
+        return torch.randn(40_000, len(cov), generator=g, dtype=torch.float64) @ root.mT
+
+    state = mean + noise(cov)
+    for a in action:
+        state = system.transition(state, a) + noise(system.transition_cov)
+    reading = state @ system.matrix.mT + system.offset(action[-1]) + noise(system.noise)
+    assert_equal(ahead.observation.mean[-1], reading.mean(0), 0.05)
+    assert_equal(ahead.observation.cov[-1], reading.mT.cov(), 0.05 * float(reading.var(0).max()))
+
+
+def test_the_first_forecast_of_a_constant_filter_is_its_own_prediction():
+    module = BeliefFilter(5, 2, 3, dtype=torch.float64)
+    mean, action = torch.randn(4, 3).double(), torch.randn(4, 2, 2).double()
+    ahead = module.forecast(mean, None, action)
+    predicted = module.predict(mean, action[:, 0], torch.zeros(4, dtype=torch.bool))
+    assert_equal(ahead.state.mean[:, 0], predicted.mean)
+    assert_equal(ahead.state.cov[:, 0], predicted.cov)
+
+
+def test_the_last_smoothed_belief_of_a_filter_is_its_filtered_one_where_it_starts_afresh():
+    module = BeliefFilter(5, 2, 3, dtype=torch.float64)
+    x, observed = torch.randn(4, 6, 5).double(), torch.rand(4, 6, 5) < 0.7
+    reset = torch.zeros(4, 6, dtype=torch.bool)
+    reset[:, 0] = reset[:, -1] = True
+    sequence = (torch.zeros(4, 3).double(), None, torch.zeros(4, 6, 2).double(), x, observed, reset)
+    smoothed, filtered = module.smooth(*sequence), module(*sequence, return_cov=True)
+    assert_equal(smoothed.mean[:, -1], filtered.mean[:, -1])
+    assert_equal(smoothed.cov[:, -1], filtered.cov[:, -1])
+    x[0, 0, observed[0, 0].nonzero()[0]] = math.nan
+    with pytest.raises(ValueError, match="`observation` holds NaN"):
+        module.smooth(*sequence)
+
+
+def test_the_row_wise_jacobian_is_that_of_autograd_and_can_be_differentiated():
+    problem = Problem(3, 4)
+    f, mean = problem.model().transition, torch.randn(2, 3, dtype=torch.float64)
+    action = torch.randn(2, 2, dtype=torch.float64)
+    found = row_jacobian(f, mean, action)
+    for row in range(2):
+        F = torch.autograd.functional.jacobian(lambda m, r=row: f(m, action[r]), mean[row])
+        assert_equal(found[row], F)
+    mean.requires_grad_()
+    assert torch.autograd.gradcheck(lambda m: row_jacobian(f, m, action), mean)
+
+
+def test_bad_input_is_named_and_no_step_is_no_error():
+    system, data = linear()
+    model = space(system)
+    with pytest.raises(ValueError, match="`observed` must be bool"):
+        smooth_sequence(model, *inputs(data)[:4], data.observed.float(), data.reset)
+    with pytest.raises(ValueError, match="`mean` and `cov` must have shapes"):
+        smooth_sequence(model, data.start_mean, torch.eye(3), *inputs(data)[2:])
+    with pytest.raises(ValueError, match="`action` must have shape"):
+        forecast(model, data.start_mean, None, data.previous_action[..., :1])
+    empty = smooth_sequence(model, *inputs(data, steps=slice(0)))
+    assert empty.mean.shape == (3, 0, 3)
+    assert forecast(model, data.start_mean, None, data.previous_action[:, :0]).state.cov.shape == (
+        3, 0, 3, 3,
+    )  # fmt: skip
+    with torch.no_grad():
+        out = filter_sequence(model, *(x for x in inputs(data) if x is not None))
+    assert out.cov is None

@@ -1,0 +1,262 @@
+"""Beliefs about the past given all readings, and about the future given none: for logged data.
+
+Both propagate the covariance through the transition's Jacobian F, whatever the filter that acts
+does with it: exact for a linear transition, the extended Kalman filter and smoother for another.
+A Q that was trained without propagation holds the share of the past already, so that it is counted
+twice here and the covariances are too wide; train with ``covariance="propagated"`` for these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional.gaussian import Belief, as_matrix, factorise, without_autocast
+from torchrl_drbpn.functional.kalman import predict, update
+from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
+
+__all__ = ["Forecast", "Jacobian", "forecast", "row_jacobian", "smooth_sequence"]
+
+# F, shape (state, state), or a function of (mean, action) that returns (*batch, state, state).
+Jacobian = Tensor | Callable[[Tensor, Tensor], Tensor]
+
+
+class Forecast(NamedTuple):
+    """Hold what is expected of the steps ahead.
+
+    Args:
+        state: beliefs, mean ``(*batch, ahead, state)``, cov ``(*batch, ahead, state, state)``.
+        observation: of the readings, noise included: ``(*batch, ahead, obs)``, ``(..., obs, obs)``.
+
+    Example:
+        >>> Forecast._fields
+        ('state', 'observation')
+    """
+
+    state: Belief
+    observation: Belief
+
+
+def smooth_sequence(
+    model: StateSpace,
+    mean: Tensor,
+    cov: Tensor | None,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    *,
+    jacobian: Jacobian | None = None,
+    emission_cov: Tensor | None = None,
+) -> Belief:
+    r"""Return the beliefs given the readings of the whole sequence, later ones included.
+
+    .. math::
+        G_t = P_t F_{t+1}' (P^-_{t+1})^{-1}, \quad
+        m^s_t = m_t + G_t (m^s_{t+1} - m^-_{t+1}), \quad
+        P^s_t = P_t + G_t (P^s_{t+1} - P^-_{t+1}) G_t'
+
+    with :math:`P^-_{t+1} = F_{t+1} P_t F_{t+1}' + Q`: the Rauch-Tung-Striebel smoother, §8.2
+    [Särkkä 2013], extended by the Jacobian F (§9.1) where f is not linear. The covariance is
+    computed as :math:`(I - G F) P (I - G F)' + G (P^s + Q) G'`, equal and always positive definite.
+    Nothing passes an episode start. In float64 but for the transition.
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
+        cov: its covariance, shape ``(*batch, state, state)``; None: 0, so that the first predicted
+            covariance is Q. Neither is read where the first step is a reset.
+        previous_action: shape ``(*batch, time, action)``.
+        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, time, obs)``.
+        reset: bool, shape ``(*batch, time)``; True starts from the initial belief.
+
+    Keyword Args:
+        jacobian: F, ``(state, state)``, or a function of (mean, action); None: that of the
+            transition at the filtered mean of every row.
+        emission_cov: R of every step, shape ``(*batch, time, obs, obs)``; None: the model's.
+
+    Returns:
+        Smoothed beliefs, shapes ``(*batch, time, ...)``; differentiable.
+
+    Raises:
+        ValueError: for a wrong shape or dtype, or a covariance that is not positive definite.
+
+    Example:
+        >>> import torch
+        >>> one = torch.ones(1, 1)
+        >>> model = StateSpace(
+        ...     lambda m, a: m, one, one, torch.ones(1), 0 * one, torch.zeros(1), torch.zeros(1),
+        ...     one)
+        >>> seen = torch.tensor([True, False, True]).unsqueeze(-1)
+        >>> reset = torch.tensor([True, False, False])
+        >>> belief = smooth_sequence(model, torch.zeros(1), None, torch.zeros(3, 1),
+        ...                          torch.tensor([[0.0], [0.0], [3.0]]), seen, reset)
+        >>> bool((belief.mean.diff(dim=0) > 0).all())  # the gap leads to the reading behind it
+        True
+
+    See also :func:`filter_sequence`, which reads the past alone.
+    """
+    steps = tuple(reset.shape)
+    model.check_inputs(steps, steps[:-1], mean, previous_action, observation, observed, reset)
+    H, offset, dtype = model.emission_matrix, model.offset(previous_action), mean.dtype
+    with without_autocast(mean):
+        belief = _start(model, mean, cov)
+        filtered, predictions = [], []
+        for t in range(steps[-1]):
+            R = model.emission_cov if emission_cov is None else emission_cov[..., t, :, :]
+            step = _predict(model, belief, previous_action[..., t, :], jacobian, reset[..., t])
+            belief = update(
+                step.predicted, observation[..., t, :], observed[..., t, :], H, R, offset[..., t, :]
+            )
+            filtered.append(belief)
+            predictions.append(step)
+        smoothed = filtered[-1:]
+        for (m, P), (after, F, Q) in zip(filtered[-2::-1], predictions[:0:-1], strict=True):
+            factor = factorise("the predicted covariance", after.cov)
+            G = torch.cholesky_solve(F @ P, factor).mT
+            ahead = smoothed[-1]
+            kept = torch.eye(P.shape[-1], dtype=P.dtype, device=P.device) - G @ F
+            back = kept @ P @ kept.mT + G @ (ahead.cov + Q) @ G.mT
+            move = (G @ (ahead.mean - after.mean).unsqueeze(-1)).squeeze(-1)
+            smoothed.append(Belief(m + move, 0.5 * (back + back.mT)))
+        return _stacked(smoothed[::-1], belief, dtype)
+
+
+def forecast(
+    model: StateSpace,
+    mean: Tensor,
+    cov: Tensor | None,
+    action: Tensor,
+    *,
+    jacobian: Jacobian | None = None,
+) -> Forecast:
+    r"""Predict the steps ahead, of which nothing was read.
+
+    .. math::
+        m_{j} = f(m_{j-1}, a_{j}), \quad P_{j} = F_{j} P_{j-1} F_{j}' + Q, \qquad
+        x_j \sim N(H m_j + B a_j + d,\; H P_j H' + R)
+
+    §4.1 [Särkkä 2013], extended by the Jacobian (§5.2) where f is not linear.
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean, shape ``(*batch, state)``.
+        cov: its covariance, shape ``(*batch, state, state)``; None: 0, so that the first predicted
+            covariance is Q, as the filter with a constant covariance has it.
+        action: the actions ahead, ``(*batch, ahead, action)``; entry j leads to step j.
+
+    Keyword Args:
+        jacobian: see :func:`smooth_sequence`.
+
+    Returns:
+        :class:`Forecast`; differentiable.
+
+    Raises:
+        ValueError: for a wrong shape or dtype.
+
+    Example:
+        >>> import torch
+        >>> one = torch.ones(1, 1)
+        >>> model = StateSpace(
+        ...     lambda m, a: m, one, one, torch.ones(1), 0 * one, torch.zeros(1), torch.zeros(1),
+        ...     one)
+        >>> ahead = forecast(model, torch.zeros(1), None, torch.zeros(3, 1))
+        >>> ahead.state.cov.flatten().tolist(), ahead.observation.cov.flatten().tolist()
+        ([1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
+    """
+    start, dtype, H = tuple(mean.shape[:-1]), mean.dtype, model.emission_matrix
+    if action.shape[:-2] != start or action.shape[-1:] != (model.action_dim,) or action.ndim < 2:
+        raise ValueError(
+            f"`action` must have shape (*batch, ahead, action), *batch = {start} and action = "
+            f"{model.action_dim}, got {tuple(action.shape)}: one action for each step ahead."
+        )
+    with without_autocast(mean):
+        belief = _start(model, mean, cov)
+        never, steps = torch.zeros(start, dtype=torch.bool, device=mean.device), []
+        for a in action.unbind(-2):
+            steps.append(_predict(model, belief, a, jacobian, never).predicted)
+            belief = steps[-1]
+        state = _stacked(steps, belief, dtype)
+        readings = state.mean @ H.mT + model.offset(action)
+        return Forecast(state, Belief(readings, H @ state.cov @ H.mT + model.full_emission_cov()))
+
+
+def row_jacobian(
+    transition: TransitionMLP | Callable[[Tensor, Tensor], Tensor], mean: Tensor, action: Tensor
+) -> Tensor:
+    """Differentiate a transition by the mean, each row by itself.
+
+    Args:
+        transition: f of (mean, action), row by row.
+        mean: shape ``(*batch, state)``.
+        action: shape ``(*batch, action)``.
+
+    Returns:
+        F, shape ``(*batch, state, state)``; differentiable again.
+
+    Example:
+        >>> import torch
+        >>> F = row_jacobian(lambda m, a: m * a, torch.ones(2, 3), torch.full((2, 3), 5.0))
+        >>> torch.equal(F, 5 * torch.eye(3).expand(2, 3, 3))
+        True
+    """
+    state = mean.shape[-1]
+    # Rows do not mix, so the derivative of their sum holds that of each.
+    by_row = torch.func.jacrev(lambda m: transition(m, action).reshape(-1, state).sum(0))(mean)
+    return by_row.movedim(0, -2)
+
+
+class _Step(NamedTuple):
+    """A predicted belief, and how it came from the filtered one before: F and Q."""
+
+    predicted: Belief
+    jacobian: Tensor
+    transition_cov: Tensor
+
+
+def _predict(
+    model: StateSpace, belief: Belief, action: Tensor, jacobian: Jacobian | None, reset: Tensor
+) -> _Step:
+    """Predict one step in float64; at a reset the initial belief, on which F = 0 lets nothing."""
+    row, dtype = reset.unsqueeze(-1), model.emission_matrix.dtype
+    mean = belief.mean.masked_fill(row, 0.0).to(dtype)
+    if jacobian is None:
+        F = row_jacobian(model.transition, mean, action)
+    else:
+        F = jacobian if isinstance(jacobian, Tensor) else jacobian(mean, action)
+    Q = model.transition_cov
+    Q = as_matrix("transition_cov", Q if isinstance(Q, Tensor) else Q(mean, action), mean.shape[-1])
+    F, Q, block = F.double(), Q.double(), row.unsqueeze(-1)
+    F = torch.where(block, 0.0, F)
+    before = Belief(mean.double(), belief.cov.masked_fill(block, 0.0))
+    cov = predict(before, lambda m, _: m, Q, action, jacobian=F).cov
+    moved = model.predicted_mean(mean, action, row).double()
+    cov = torch.where(block, model.full_initial_cov().double(), cov)
+    return _Step(Belief(moved, cov), F, Q)
+
+
+def _start(model: StateSpace, mean: Tensor, cov: Tensor | None) -> Belief:
+    """Check the belief before the first step, and return it in float64."""
+    state = model.state_dim
+    if mean.shape[-1:] != (state,) or (cov is not None and cov.shape != (*mean.shape, state)):
+        raise ValueError(
+            f"`mean` and `cov` must have shapes (*batch, {state}) and (*batch, {state}, {state}), "
+            f"got {tuple(mean.shape)} and {None if cov is None else tuple(cov.shape)}."
+        )
+    zero = torch.zeros(*mean.shape, state, dtype=torch.float64, device=mean.device)
+    return Belief(mean.double(), zero if cov is None else cov.double())
+
+
+def _stacked(beliefs: list[Belief], like: Belief, dtype: torch.dtype) -> Belief:
+    """Stack beliefs over time; there may be no step at all."""
+    if not beliefs:
+        return Belief(
+            like.mean.to(dtype).unsqueeze(-2)[..., :0, :],
+            like.cov.to(dtype).unsqueeze(-3)[..., :0, :, :],
+        )
+    means, covs = zip(*beliefs, strict=True)
+    return Belief(torch.stack(means, -2).to(dtype), torch.stack(covs, -3).to(dtype))
