@@ -1,9 +1,11 @@
-"""What the transforms share: keys, specs, order, and the frame of those that corrupt."""
+"""What the transforms share: keys, numbers, specs, order, and the frame of those that corrupt."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
+from itertools import takewhile
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -35,13 +37,9 @@ def as_key_list(keys: Keys) -> list[NestedKey]:
 
 
 def sibling_key(key: NestedKey, name: str) -> NestedKey:
-    """Return the key called `name` beside `key`."""
-    return (*key[:-1], name) if isinstance(key, tuple) else name
-
-
-def last_name(key: NestedKey) -> str:
-    """Return the name of an entry without the names of what it lies in."""
-    return str(key[-1]) if isinstance(key, tuple) else key
+    """Return the key called `name` beside `key`; a `{}` in it stands for what `key` is called."""
+    *folder, last = key if isinstance(key, tuple) else (key,)
+    return unravel_key((*folder, name.format(last)))
 
 
 def pair_keys(
@@ -55,6 +53,37 @@ def pair_keys(
             f"{list(in_keys)}, got {pairs}. Pass a list of {len(in_keys)} different keys."
         )
     return pairs
+
+
+# ---------------------------------------------------------------------------------------- numbers
+def read_numbers(
+    value: object,
+    name: str,
+    meaning: str,
+    least: float = 0.0,
+    most: float = math.inf,
+    *,
+    whole: bool = False,
+    several: bool = True,
+) -> Tensor:
+    """Return a number or, where `several`, a list of them as float64, or as int64 where `whole`."""
+    try:
+        read = torch.as_tensor(value, dtype=None if whole else torch.float64).cpu()
+    except (TypeError, ValueError, RuntimeError):
+        read = torch.tensor(math.nan)
+    broken = whole and (read.is_floating_point() or read.dtype is torch.bool)
+    inside = (read >= least) & (read <= most) & read.isfinite()
+    if broken or read.ndim > several or not bool(inside.all()):
+        raise ValueError(f"`{name}` must be {meaning}, got {value!r}.")
+    return read
+
+
+def check_count(numbers: Tensor | None, name: str, count: int, per: str) -> None:
+    """Refuse numbers that are neither one nor `count`."""
+    if numbers is not None and numbers.ndim and numbers.shape[0] != count:
+        raise ValueError(
+            f"`{name}` must have one entry per {per}, {count}, got {numbers.shape[0]}."
+        )
 
 
 # --------------------------------------------------------------- checks, of specs and of data alike
@@ -123,16 +152,14 @@ def environment_of(transform: Transform) -> EnvBase | None:
     return env
 
 
-def _transforms_before(transform: Transform) -> Iterator[Transform]:
-    """Yield the transforms that come before `transform`; those inside workers can't be seen."""
-    env = environment_of(transform)
+def chain_of(transform: Transform) -> Iterator[Transform]:
+    """Yield the transforms of its environment in their order; those in workers can't be seen."""
+    env, layers = environment_of(transform), []
     while isinstance(env, TransformedEnv):
-        for part in env.transform.modules():
-            if part is transform:
-                break
-            if isinstance(part, Transform):
-                yield part
+        layers.append([part for part in env.transform.modules() if isinstance(part, Transform)])
         env = env.base_env
+    for layer in reversed(layers):
+        yield from layer
 
 
 def flagged_rows(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> Tensor | None:
@@ -147,10 +174,9 @@ def flagged_rows(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> T
 
 
 class EnvironmentTransform(Transform):
-    """A transform that works in an environment alone and refuses stored data.
+    """A transform that works in an environment alone; `why_online` is the reason it gives.
 
-    A replay buffer calls `inv` on what comes in and `forward` on what goes out. `why_online` is
-    the reason in the error message.
+    A replay buffer, which it refuses, calls `inv` on what comes in and `forward` on what goes out.
     """
 
     why_online: ClassVar[str]
@@ -190,6 +216,14 @@ class Step(NamedTuple):
     data: TensorDictBase
 
 
+class CorruptionKeys(TypedDict, total=False):
+    """Keyword arguments of every transform that corrupts, see `ObservationMissingness`."""
+
+    in_keys: Keys
+    mask_keys: Keys | None
+    complete_key: Keys | None
+
+
 class CorruptingTransform(Transform):
     """The frame of the transforms that change what arrives: keys, masks, specs, step and reset.
 
@@ -203,6 +237,8 @@ class CorruptingTransform(Transform):
     writes_mask: ClassVar[bool] = True
     # where what arrives is of an earlier step, the mask of this one must not be ANDed into it
     ands_mask: ClassVar[bool] = True
+    # attributes that hold one number for all components, or one for each
+    per_component: ClassVar[tuple[str, ...]] = ()
     out_keys: list[NestedKey]
 
     def __init__(
@@ -235,6 +271,8 @@ class CorruptingTransform(Transform):
 
     def _check_obs_dim(self, obs_dim: int) -> None:
         """Raise a ValueError where the transform was made for another number of components."""
+        for name in self.per_component:
+            check_count(getattr(self, name), name, obs_dim, "component")
 
     def _check(self, source: Composite | TensorDictBase) -> list[Any]:
         """Return the specs or the data of the observations, checked."""
@@ -270,11 +308,11 @@ class CorruptingTransform(Transform):
                 arrived = observed if arrived is None else arrived & observed
             if arrived is not None:
                 corrupted = zero_missing(corrupted, arrived)
-            written = [(self.in_keys, _split(corrupted, parts))]
+            written = [(self.in_keys, split_like(corrupted, parts))]
             if self.complete_keys:
                 written.append((self.complete_keys, parts))
             if self.writes_mask and arrived is not None:
-                written.append((self.mask_keys, _split(arrived, parts)))
+                written.append((self.mask_keys, split_like(arrived, parts)))
             for keys, values in written:
                 for place, value in zip(places, values, strict=True):
                     tensordict.set(keys[place], value)
@@ -312,7 +350,7 @@ class CorruptingTransform(Transform):
 
     def _check_order(self) -> None:
         name, keys = type(self).__name__, set(self.in_keys)
-        for earlier in _transforms_before(self):
+        for earlier in takewhile(lambda part: part is not self, chain_of(self)):
             role, other = getattr(earlier, "role", None), type(earlier).__name__
             if role is None or keys.isdisjoint([*earlier.in_keys, *earlier.out_keys]):
                 continue
@@ -333,8 +371,7 @@ def _join(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
 
-def _split(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
-    if len(parts) == 1:
-        return [joined]
-    pieces: Sequence[Tensor] = torch.split(joined, [part.shape[-1] for part in parts], -1)
-    return pieces
+def split_like(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Cut one vector into pieces as wide as `parts`."""
+    sizes = [part.shape[-1] for part in parts]
+    return [joined] if len(parts) == 1 else torch.split(joined, sizes, -1)

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from numbers import Integral, Real
-from typing import Any, ClassVar, NamedTuple
+from numbers import Integral
+from typing import Any, ClassVar, Unpack
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
-from torchrl_drbpn.functional.missingness import OutageRates, sample_fault_steps
 from torchrl_drbpn.transforms._base import (
     Keys,
     Step,
     as_key_list,
+    check_count,
     enter_new,
+    read_numbers,
     read_vector,
     sibling_key,
 )
-from torchrl_drbpn.transforms.seeding import SeededTransform
+from torchrl_drbpn.transforms.seeding import SeededKeys, SeededTransform
+
+Groups = Sequence[Sequence[int]]
+
+
+class GroupedKeys(SeededKeys, total=False):
+    """And the sensors that go together."""
+
+    groups: Groups | None
+
+
+class CarriedKeys(GroupedKeys, total=False):
+    """And where the state is kept."""
+
+    state_keys: Keys | None
 
 
 class CarriedStateTransform(SeededTransform):
@@ -29,10 +43,13 @@ class CarriedStateTransform(SeededTransform):
 
     What it remembers travels in the tensordict, as the counts of TorchRL's `StepCounter` do, so
     that partial resets and workers hold and a stored step says what the next starts from. A
-    subclass names its states and says of what shape they are.
+    simulator that resets itself inside its step carries it over to the next episode. A subclass
+    names its states and says of what shape they are.
 
     Args:
-        groups: lists of indices of sensors that go together, or None for each by itself.
+        groups: lists of indices of sensors that go together (negative ones count from the end),
+            each index in one list at most, over all keys of one vector; what is in none is left
+            alone. None: every component by itself.
         state_keys: where the states are kept; None: under `state_names` beside the first
             observation.
         **keys: passed on to `SeededTransform`.
@@ -41,9 +58,15 @@ class CarriedStateTransform(SeededTransform):
     state_names: ClassVar[tuple[str, ...]]
     # what errors call the argument that names the states
     state_argument: ClassVar[str] = "state_keys"
+    # attributes that hold one number for all groups, or one for each
+    per_group: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
-        self, *, groups: Sequence[Sequence[int]] | None, state_keys: Keys | None, **keys: Any
+        self,
+        *,
+        groups: Groups | None = None,
+        state_keys: Keys | None = None,
+        **keys: Unpack[SeededKeys],
     ) -> None:
         super().__init__(**keys)
         self.groups = None if groups is None else _read_groups(groups)
@@ -58,7 +81,6 @@ class CarriedStateTransform(SeededTransform):
                 f"beside {self.out_keys}, which this transform writes something else to."
             )
         self.out_keys = [*self.out_keys, *self.state_keys]
-        self._columns: Tensor | None = None
 
     # ------------------------------------------------------------------------------------ groups
     def _count(self, obs_dim: int) -> int:
@@ -76,22 +98,12 @@ class CarriedStateTransform(SeededTransform):
             return of_group.expand(observation.shape)
         of_group = of_group.expand(*observation.shape[:-1], len(self.groups))
         outside = torch.full_like(of_group[..., :1], rest)
-        columns = self._columns_for(observation)
-        return torch.cat([of_group, outside], -1).index_select(-1, columns)
-
-    def _columns_for(self, observation: Tensor) -> Tensor:
-        """Return the group of every component; the number of groups where it is in none."""
-        columns = self._columns
-        if columns is None or columns.device != observation.device:
-            groups = self.groups or []
-            columns = torch.full(observation.shape[-1:], len(groups))
-            for index, group in enumerate(groups):
-                columns[group] = index
-            columns = self._columns = columns.to(observation.device)
-        return columns
+        return torch.cat([of_group, outside], -1)[..., self._column.to(observation.device)]
 
     def _check_obs_dim(self, obs_dim: int) -> None:
-        indices = [index for group in self.groups or [] for index in group]
+        super()._check_obs_dim(obs_dim)
+        groups = self.groups or []
+        indices = [index for group in groups for index in group]
         if any(not -obs_dim <= index < obs_dim for index in indices):
             raise ValueError(
                 f"`groups` must hold indices from {-obs_dim} to {obs_dim - 1} for in_keys "
@@ -101,6 +113,14 @@ class CarriedStateTransform(SeededTransform):
             raise ValueError(
                 f"`groups` must name every component once at most, got {self.groups} for {obs_dim} "
                 f"components. Use two {type(self).__name__} where a sensor can fail in two ways."
+            )
+        # the group of every component; the number of groups where it is in none
+        self._column = torch.full((obs_dim,), len(groups))
+        for place, group in enumerate(groups):
+            self._column[group] = place
+        for name in self.per_group:
+            check_count(
+                getattr(self, name), name, self._count(obs_dim), "group (component, without groups)"
             )
 
     # ------------------------------------------------------------------------------------- state
@@ -137,26 +157,25 @@ class CarriedStateTransform(SeededTransform):
         for key, state in zip(self.state_keys, states, strict=True):
             step.data.set(key, state)
 
-    def _state_specs(self, spec: Composite) -> list[TensorSpec]:
+    def _state_specs(self, spec: Composite) -> list[tuple[NestedKey, TensorSpec]]:
         leaves = [read_vector(spec, key, self) for key in self.in_keys]
         made: list[TensorSpec] = []
         for event, dtype in self._layout(sum(leaf.shape[-1] for leaf in leaves)):
             shape, device = (*leaves[0].shape[:-1], *event), leaves[0].device
             kind = Binary if dtype is torch.bool else Unbounded
             made.append(kind(shape=shape, device=device, dtype=dtype or leaves[0].dtype))
-        return made
+        return list(zip(self.state_keys, made, strict=True))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Enter the observation, its mask, the states and, on request, what was complete."""
         spec = super().transform_observation_spec(observation_spec)
-        for key, leaf in zip(self.state_keys, self._state_specs(spec), strict=True):
+        for key, leaf in self._state_specs(spec):
             enter_new(spec, key, leaf, self)
         return spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         """Enter the states as what a step reads."""
-        specs = self._state_specs(self.parent.full_observation_spec)
-        for key, leaf in zip(self.state_keys, specs, strict=True):
+        for key, leaf in self._state_specs(self.parent.full_observation_spec):
             state_spec[key] = leaf
         return state_spec
 
@@ -165,7 +184,7 @@ def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def _read_groups(groups: Sequence[Sequence[int]]) -> list[list[int]]:
+def _read_groups(groups: Groups) -> list[list[int]]:
     lists = [[] if isinstance(group, str | Integral) else list(group) for group in groups]
     whole = all(isinstance(i, Integral) and not isinstance(i, bool) for g in lists for i in g)
     if not lists or not all(lists) or not whole:
@@ -175,91 +194,9 @@ def _read_groups(groups: Sequence[Sequence[int]]) -> list[list[int]]:
     return [[int(index) for index in group] for group in lists]
 
 
-# -------------------------------------------------------------------------------- when faults occur
-class Lifecycle(NamedTuple):
-    """When faults begin and end: drawn at every step, or at a fixed step of every episode.
-
-    The state is an int64 count for each group: how many steps its fault has lasted, this one
-    included; 0 or less while it works. Every group works before an episode begins.
-
-    Attributes:
-        rates: probabilities of a fault's begin and end, or None where `onset` fixes it.
-        onset: the step at which faults begin, 0 for the reset.
-        duration: how many steps they last.
-    """
-
-    rates: OutageRates | None
-    onset: int
-    duration: float
-
-    def advance(
-        self, steps: Tensor | None, like: Tensor, generator: torch.Generator | None
-    ) -> Tensor:
-        """Return the counts at this step from those of the step before, None at a reset."""
-        if self.rates is not None:
-            return sample_fault_steps(steps, self.rates, like, generator)
-        if steps is None:
-            return torch.full(like.shape, 1 - self.onset, dtype=torch.int64, device=like.device)
-        return steps + 1
-
-    def active(self, steps: Tensor) -> Tensor:
-        """Return which groups have a fault now, bool."""
-        return (steps > 0) & (steps <= self.duration)
-
-
-def read_lifecycle(
-    probability: float | None, mean_length: float | None, onset: int | None, duration: int | None
-) -> Lifecycle:
-    """Check the four arguments that say when faults begin and end; None: not given."""
-    if (probability is None) == (onset is None):
-        raise ValueError(
-            "`probability` (with `mean_length`) draws when a fault begins, `onset` (with "
-            f"`duration`) fixes it: give one of them, got probability={probability!r} and "
-            f"onset={onset!r}."
-        )
-    if probability is None:
-        if mean_length is not None:
-            raise ValueError("`mean_length` goes with `probability`; with `onset` give `duration`.")
-        first = read_whole(onset, "onset", 0, several=False)
-        last = math.inf
-        if duration is not None:
-            last = float(read_whole(duration, "duration", 1, several=False))
-        return Lifecycle(None, int(first), last)
-    if duration is not None:
-        raise ValueError("`duration` goes with `onset`; with `probability` give `mean_length`.")
-    if not isinstance(probability, Real) or not 0 <= probability <= 1:
-        raise ValueError(
-            "`probability` must be that of a fault to begin at a step, in [0, 1], got "
-            f"{probability!r}."
-        )
-    mean_length = math.inf if mean_length is None else mean_length
-    if not isinstance(mean_length, Real) or not mean_length >= 1:
-        raise ValueError(
-            "`mean_length` must be the mean length of a fault in steps, at least 1 and infinite "
-            f"for one that never ends, got {mean_length!r}."
-        )
-    return Lifecycle(OutageRates(float(probability), 1.0 / mean_length), 0, math.inf)
-
-
-# ----------------------------------------------------------------------------------- whole numbers
-def read_whole(value: object, name: str, least: int, *, several: bool = True) -> Tensor:
-    """Return a whole number, or one for each group, as int64 of shape `()` or `(groups,)`."""
-    given = value.tolist() if isinstance(value, Tensor) else value
-    listed = several and isinstance(given, Sequence) and not isinstance(given, str)
-    items: list[Any] = list(given) if listed else [given]  # type: ignore[call-overload]
-    whole = all(isinstance(item, Integral) and not isinstance(item, bool) for item in items)
-    if not items or not whole or min(items) < least:
-        more = ", or one for each group of sensors" if several else ""
-        raise ValueError(
-            f"`{name}` must be a whole number of steps, at least {least}{more}, got {value!r}."
-        )
-    return torch.tensor(items if len(items) > 1 else int(items[0]))
-
-
-def check_count(numbers: Tensor, name: str, groups: int) -> None:
-    """Refuse numbers that are neither one nor as many as there are groups."""
-    if numbers.ndim and numbers.shape[0] != groups:
-        raise ValueError(
-            f"`{name}` must have one entry for each of the {groups} groups (components, where "
-            f"there are no groups), got {numbers.shape[0]}."
-        )
+def read_steps(value: Any, name: str, least: int, *, several: bool = True) -> Tensor:
+    """Return a whole number of steps, or one for each group, as int64 `()` or `(groups,)`."""
+    more = ", or one for each group of sensors" if several else ""
+    meaning = f"a whole number of steps, at least {least}{more}"
+    read = read_numbers(value, name, meaning, least, whole=True, several=several)
+    return read.squeeze() if read.numel() == 1 else read

@@ -15,10 +15,8 @@ from torchrl_drbpn.transforms._base import (
     as_key_list,
     check_mask,
     flagged_rows,
-    last_name,
     pair_keys,
     read_vector,
-    sibling_key,
     unbounded_like,
 )
 
@@ -31,7 +29,7 @@ class FillLastObserved(EnvironmentTransform):
     counts of TorchRL's `StepCounter` do, so partial resets and batched environments hold.
 
     Args:
-        in_keys: observations, shape `(*batch, obs)`, floating point. Default `"observation"`.
+        in_keys: observations, shape `(*batch, obs)`, floating point.
         mask_keys: one mask per observation, bool, shape `(*batch, obs)`, True where observed.
             Default `"observed"` beside each observation.
         out_keys: where to write. Default in place.
@@ -40,8 +38,7 @@ class FillLastObserved(EnvironmentTransform):
         fill_value: what stands in for an entry never observed in this episode, in the units that
             the observation has at this place of the chain; NaN marks it for
             `MaskedObservationNorm(missing="keep")`.
-        state_keys: where the last values are kept, in the observation spec and the state spec.
-            Default `last_<name>` beside each observation.
+        state_keys: where the last values are kept. Default `last_<name>` beside each observation.
 
     Raises:
         ValueError: if numbers of keys do not match, or missingness stands after the transform.
@@ -73,17 +70,13 @@ class FillLastObserved(EnvironmentTransform):
         outputs = pair_keys(inputs, out_keys or inputs, name="out_keys", default="")
         super().__init__(in_keys=inputs, out_keys=outputs)
         self.mask_keys = pair_keys(inputs, mask_keys, name="mask_keys", default="observed")
-        if state_keys is None:
-            state_keys = [sibling_key(key, f"last_{last_name(key)}") for key in inputs]
-        self.state_keys = pair_keys(inputs, state_keys, name="state_keys", default="")
+        self.state_keys = pair_keys(inputs, state_keys, name="state_keys", default="last_{}")
         self.fill_value = float(fill_value)
-        self._keys = list(
-            zip(self.in_keys, self.mask_keys, self.out_keys, self.state_keys, strict=True)
-        )
+        self._keys = list(zip(inputs, self.mask_keys, outputs, self.state_keys, strict=True))
         self._checked = False
 
     def _check(self, source: Composite | TensorDictBase) -> None:
-        for key, mask_key in zip(self.in_keys, self.mask_keys, strict=True):
+        for key, mask_key, _, _ in self._keys:
             leaf = read_vector(source, key, self)
             if mask_key not in source.keys(True, True):
                 raise KeyError(
@@ -137,7 +130,6 @@ class FillLastObserved(EnvironmentTransform):
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         """Enter the last values as a state that a step reads."""
-        observation_spec = self.parent.full_observation_spec
-        for key, state_key in zip(self.in_keys, self.state_keys, strict=True):
-            state_spec[state_key] = unbounded_like(observation_spec[key])
+        for key, _, _, state_key in self._keys:
+            state_spec[state_key] = unbounded_like(self.parent.full_observation_spec[key])
         return state_spec

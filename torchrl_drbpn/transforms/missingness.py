@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from numbers import Real
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -21,13 +21,13 @@ from torchrl_drbpn.functional.missingness import (
 )
 from torchrl_drbpn.transforms._base import (
     CorruptingTransform,
-    Keys,
+    CorruptionKeys,
     Role,
     Step,
     as_key_list,
     read_leaf,
 )
-from torchrl_drbpn.transforms.seeding import SeededTransform, check_seed
+from torchrl_drbpn.transforms.seeding import SeededKeys, SeededTransform, check_seed
 
 _KINDS = ("mcar", "mar", "nmar")
 
@@ -58,13 +58,13 @@ class ObservationMissingness(SeededTransform):
     Keyword Args:
         always_observed: share of the components that always arrive (mar, nmar), in [0, 1).
         mechanism_seed: seed of the mechanism's parameters, not negative.
+        action_key: the action (mar, nmar), shape `(*batch, action)`, of the environment itself.
         seed: None, to draw from torch's global generator, or the seed of a generator of its own,
             which gives the same draws to every worker and every transform that is built with it.
         in_keys: observation keys, each of shape `(*batch, obs)`.
         mask_keys: one mask per observation, bool `(*batch, obs)`; by default `observed` beside it.
         complete_key: key (or one key per observation) under which the observation is recorded
             before this transform; None, the default, records nothing.
-        action_key: the action (mar, nmar), shape `(*batch, action)`, of the environment itself.
 
     Raises:
         ValueError: if an argument lies outside its range, or no component could go missing.
@@ -83,7 +83,7 @@ class ObservationMissingness(SeededTransform):
         mechanism_parameters: always observed components and b0, b1, b2, in the dtype and on the
             device of the data; None under "mcar" and before the first step.
 
-    See also: `torchrl_drbpn.functional.missing_probability`, `sample_mask`.
+    See also: `torchrl_drbpn.functional.missing_probability`.
     """
 
     role: ClassVar[Role] = "missingness"
@@ -97,13 +97,10 @@ class ObservationMissingness(SeededTransform):
         *,
         always_observed: float = 0.25,
         mechanism_seed: int = 0,
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
         action_key: NestedKey = "action",
+        **keys: Unpack[SeededKeys],
     ) -> None:
-        super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
+        super().__init__(**keys)
         if mechanism not in _KINDS:
             raise ValueError(f"`mechanism` must be one of {_KINDS}, got {mechanism!r}.")
         if mechanism != "mcar" and not 0.0 <= always_observed < 1.0:
@@ -136,14 +133,9 @@ class ObservationMissingness(SeededTransform):
         action = None if step.before is None else self._action(step.before, x)
         # what an earlier transform hides does not enter the probability
         seen = x if step.observed is None else zero_missing(x, step.observed)
-        mechanism = _drawn(
-            self.mechanism,
-            (x.shape[-1], 0 if action is None else action.shape[-1]),
-            self.always_observed,
-            self.mechanism_seed,
-            x.dtype,
-            x.device,
-        )
+        sizes = x.shape[-1], 0 if action is None else action.shape[-1]
+        draw = self.mechanism, sizes, self.always_observed, self.mechanism_seed
+        mechanism = _drawn(*draw, x.dtype, x.device)
         if action is not None:
             self.mechanism_parameters = mechanism
         return x, sample_mask(missing_probability(mechanism, seen, action, self._eta), x, generator)
@@ -189,9 +181,7 @@ class SensorReduction(CorruptingTransform):
             bool of shape `(obs,)`, True where there is none, or of shape `(*batch, obs)`, with the
             batch of the data: each row, such as each environment of a batch, lacks sensors of its
             own. Several observation keys count as one vector.
-
-    Keyword Args:
-        in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
+        **keys: `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Raises:
         ValueError: if an index is out of range or the bool tensor is of another shape.
@@ -212,12 +202,9 @@ class SensorReduction(CorruptingTransform):
     def __init__(
         self,
         missing: Sequence[int] | Sequence[bool] | Tensor,
-        *,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
+        **keys: Unpack[CorruptionKeys],
     ) -> None:
-        super().__init__(in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
+        super().__init__(**keys)
         tensor = torch.as_tensor(missing).cpu()
         if tensor.numel() == 0 and tensor.dtype != torch.bool:
             tensor = tensor.to(torch.int64).reshape(-1)
@@ -271,8 +258,8 @@ class ObservedFromNaN(CorruptingTransform):
     mask already, an entry counts as observed if that mask is True and the value is not NaN.
     Infinite values are left: they are errors, not gaps.
 
-    Keyword Args:
-        in_keys, mask_keys: as in `ObservationMissingness`.
+    Args:
+        **keys: `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Example:
         >>> import torch
@@ -284,9 +271,6 @@ class ObservedFromNaN(CorruptingTransform):
     """
 
     role: ClassVar[Role] = "from_nan"
-
-    def __init__(self, *, in_keys: Keys = ("observation",), mask_keys: Keys | None = None) -> None:
-        super().__init__(in_keys=in_keys, mask_keys=mask_keys)
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         return step.observation, ~step.observation.isnan()

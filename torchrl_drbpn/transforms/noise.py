@@ -2,68 +2,42 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, TypeAlias, Unpack
 
-import torch
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite
 
 from torchrl_drbpn.functional.missingness import sample_noise, sample_spikes
-from torchrl_drbpn.transforms._base import Keys, Role, Step, enter_new, mask_like, pair_keys
-from torchrl_drbpn.transforms.seeding import SeededTransform
+from torchrl_drbpn.transforms._base import (
+    Keys,
+    Role,
+    Step,
+    enter_new,
+    mask_like,
+    pair_keys,
+    read_numbers,
+    split_like,
+)
+from torchrl_drbpn.transforms.seeding import SeededKeys, SeededTransform
 
-STD = "finite and not negative, in observation units"
-
-
-class PerComponent:
-    """A number, or one a component, from `least` to `most`, finite, in the dtype of the data."""
-
-    def __init__(
-        self, value: object, name: str, meaning: str, most: float = math.inf, least: float = 0.0
-    ) -> None:
-        try:
-            read = torch.as_tensor(value, dtype=torch.float64).cpu()
-        except (TypeError, ValueError, RuntimeError):
-            read = torch.tensor(math.nan)
-        inside = (read >= least) & (read <= most) & read.isfinite()
-        if read.ndim > 1 or not bool(inside.all()):
-            raise ValueError(
-                f"`{name}` must be a number or one number per component, {meaning}, got {value!r}."
-            )
-        self.name = name
-        self.value: float | Tensor = float(read) if read.ndim == 0 else read
-
-    def check_obs_dim(self, obs_dim: int) -> None:
-        """Refuse numbers that are neither one nor as many as there are components."""
-        if isinstance(self.value, Tensor) and self.value.shape[0] != obs_dim:
-            raise ValueError(
-                f"`{self.name}` must have one entry per component, {obs_dim}, got "
-                f"{self.value.shape[0]}."
-            )
-
-    def like(self, observation: Tensor) -> float | Tensor:
-        """Return the numbers on the device and in the dtype of `observation`."""
-        return self.value.to(observation) if isinstance(self.value, Tensor) else self.value
+Numbers: TypeAlias = float | Sequence[float] | Tensor
+NUMBERS = "a number or one number per component"
+STD = f"{NUMBERS}, finite and not negative, in observation units"
 
 
 class ObservationNoise(SeededTransform):
     r"""Add independent Gaussian noise to every component, at every step and at every reset.
 
     $\tilde x = x + \epsilon, \quad \epsilon \sim N(0, \mathrm{diag}(\text{noise\_std}^2))$, the
-    first half of Eq. (2) [DRBPN], where noise_std = 0.01 sigma.
-
-    Entries that a mask declares missing stay 0. Spec bounds are lifted, since noise leaves them.
-    Several observation keys count as one vector.
+    first half of Eq. (2) [DRBPN], where noise_std = 0.01 sigma. Entries that a mask declares
+    missing stay 0. Spec bounds are lifted, since noise leaves them.
 
     Args:
         noise_std: standard deviation in observation units; a number for all components, or one per
             component, shape `(obs,)`.
-
-    Keyword Args:
-        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
+        **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Raises:
         ValueError: if a standard deviation is negative or not finite, or their number is not that
@@ -80,31 +54,16 @@ class ObservationNoise(SeededTransform):
 
     role: ClassVar[Role] = "noise"
     writes_mask: ClassVar[bool] = False
+    per_component: ClassVar[tuple[str, ...]] = ("noise_std",)
     stream: ClassVar[int] = 1
 
-    def __init__(
-        self,
-        noise_std: float | Sequence[float] | Tensor,
-        *,
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
-    ) -> None:
-        super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
-        self._std = PerComponent(noise_std, "noise_std", STD)
-
-    @property
-    def noise_std(self) -> float | Tensor:
-        """Standard deviation in observation units, a number or shape `(obs,)`, float64."""
-        return self._std.value
-
-    def _check_obs_dim(self, obs_dim: int) -> None:
-        self._std.check_obs_dim(obs_dim)
+    def __init__(self, noise_std: Numbers, **keys: Unpack[SeededKeys]) -> None:
+        super().__init__(**keys)
+        self.noise_std = read_numbers(noise_std, "noise_std", STD)
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         x = step.observation
-        return x + sample_noise(self._std.like(x), x, self.generator(x.device)), None
+        return x + sample_noise(self.noise_std.to(x), x, self.generator(x.device)), None
 
 
 class ObservationSpikes(SeededTransform):
@@ -116,26 +75,23 @@ class ObservationSpikes(SeededTransform):
     independently for every entry and step: with `ObservationNoise` before it the error is the
     contaminated normal $(1 - p) N(0, \sigma^2) + p N(0, \sigma^2 + \text{spike\_std}^2)$ of Tukey
     ("A survey of sampling from contaminated distributions", 1960). A spiked entry arrives: its mask
-    stays True, and a model that trusts every reading is misled.
-
-    Entries that a mask declares missing stay 0 and are not spiked. Spec bounds are lifted. Several
-    observation keys count as one vector.
+    stays True, and a model that trusts every reading is misled. Entries that a mask declares
+    missing stay 0 and are not spiked. Spec bounds are lifted.
 
     Args:
         probability: that an entry is hit at a step, in [0, 1]; a number for all components, or one
             per component, shape `(obs,)`.
-        spike_std: standard deviation of the error in observation units; a number, or one per
-            component, shape `(obs,)`.
+        spike_std: standard deviation of the error in observation units, likewise.
 
     Keyword Args:
-        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         spiked_key: key (or one key per observation) under which the entries that were hit are
             recorded, bool `(*batch, obs)`; None, the default, records nothing. For evaluation: no
             policy should read it.
+        **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Raises:
-        ValueError: if a probability lies outside [0, 1], a standard deviation is negative or not
-            finite, or their number is not that of the components.
+        ValueError: if a probability or a standard deviation is out of range, or their number is not
+            that of the components.
 
     Example:
         >>> import torch
@@ -144,26 +100,22 @@ class ObservationSpikes(SeededTransform):
         >>> data = spikes._call(TensorDict({"observation": torch.zeros(1000, 3)}, [1000]))
         >>> bool(((data["observation"] != 0) == data["spiked"]).all())
         True
-
-    See also: `torchrl_drbpn.functional.sample_spikes`.
     """
 
     role: ClassVar[Role] = "noise"
     writes_mask: ClassVar[bool] = False
+    per_component: ClassVar[tuple[str, ...]] = ("probability", "spike_std")
     stream: ClassVar[int] = 4
 
     def __init__(
         self,
-        probability: float | Sequence[float] | Tensor,
-        spike_std: float | Sequence[float] | Tensor,
+        probability: Numbers,
+        spike_std: Numbers,
         *,
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
         spiked_key: Keys | None = None,
+        **keys: Unpack[SeededKeys],
     ) -> None:
-        super().__init__(seed=seed, in_keys=in_keys, mask_keys=mask_keys, complete_key=complete_key)
+        super().__init__(**keys)
         self.spiked_keys: list[NestedKey] = []
         if spiked_key is not None:
             self.spiked_keys = pair_keys(self.in_keys, spiked_key, name="spiked_key", default="")
@@ -173,31 +125,18 @@ class ObservationSpikes(SeededTransform):
                 f"`spiked_key` must name keys of its own, got {self.spiked_keys} beside {taken}."
             )
         self.out_keys = [*self.out_keys, *self.spiked_keys]
-        self._probability = PerComponent(probability, "probability", "in [0, 1]", 1.0)
-        self._std = PerComponent(spike_std, "spike_std", STD)
-
-    @property
-    def probability(self) -> float | Tensor:
-        """Probability that an entry is hit, a number or shape `(obs,)`, float64."""
-        return self._probability.value
-
-    @property
-    def spike_std(self) -> float | Tensor:
-        """Standard deviation of the error, observation units, a number or `(obs,)`, float64."""
-        return self._std.value
-
-    def _check_obs_dim(self, obs_dim: int) -> None:
-        self._probability.check_obs_dim(obs_dim)
-        self._std.check_obs_dim(obs_dim)
+        share = f"{NUMBERS}, in [0, 1]"
+        self.probability = read_numbers(probability, "probability", share, most=1.0)
+        self.spike_std = read_numbers(spike_std, "spike_std", STD)
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         x = step.observation
-        probability, std = self._probability.like(x), self._std.like(x)
+        probability, std = self.probability.to(x), self.spike_std.to(x)
         error, hit = sample_spikes(probability, std, x, self.generator(x.device))
         if self.spiked_keys:
             arrived = hit if step.observed is None else hit & step.observed
-            sizes = [step.data.get(key).shape[-1] for key in self.in_keys]
-            for key, part in zip(self.spiked_keys, torch.split(arrived, sizes, -1), strict=True):
+            parts = split_like(arrived, [step.data.get(key) for key in self.in_keys])
+            for key, part in zip(self.spiked_keys, parts, strict=True):
                 step.data.set(key, part)
         return x + error, None
 

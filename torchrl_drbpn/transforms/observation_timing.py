@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeAlias, Unpack
 
 import torch
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.envs import StepCounter
 
 from torchrl_drbpn.functional.missingness import sample_delay
-from torchrl_drbpn.transforms._base import Keys, Role, Step, environment_of
-from torchrl_drbpn.transforms._carried import CarriedStateTransform, check_count, read_whole
+from torchrl_drbpn.transforms._base import Role, Step, chain_of, check_count
+from torchrl_drbpn.transforms._carried import CarriedKeys, CarriedStateTransform, read_steps
+
+Steps: TypeAlias = int | Sequence[int] | Tensor
 
 
 class ObservationDelay(CarriedStateTransform):
@@ -25,10 +27,9 @@ class ObservationDelay(CarriedStateTransform):
     `in_order=True`. What arrives counts as observed and is d steps old: nothing tells its age.
 
     With a delay of d the first d steps of an episode show nothing. A reading that a mask hides was
-    never sent: the mask so far is delayed with its readings. What is on its way travels in the
-    tensordict under `state_keys`, so that partial resets and workers hold; it is max_delay
-    observations a step. A simulator that resets itself inside its step lets the last readings of
-    an episode arrive in the next one.
+    never sent: the mask so far is delayed with its readings. What is on its way, max_delay
+    observations a step, travels in the tensordict under `state_keys`. A simulator that resets
+    itself inside its step lets the last readings of an episode arrive in the next one.
 
     Args:
         delay: steps, 0 or more; a number for all, or one for each group (each component, where
@@ -38,19 +39,17 @@ class ObservationDelay(CarriedStateTransform):
         max_delay: the most that a delay is drawn to, in the form of `delay`; None, the default:
             `delay` is fixed.
         in_order: drop readings that arrive after one that was taken later.
-        groups: lists of indices that travel together, in one packet (negative ones count from the
-            end), each index in one list at most; entries in none arrive at once. None, the default:
-            every entry by itself. Several observation keys count as one vector.
-        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
-        state_keys: where what is on its way is kept, its values and its mask, each of shape
-            `(*batch, max_delay, obs)`; by default `delayed_observation` and `delayed_observed`
-            beside the first observation.
+        **keys: `groups` as in `SensorOutages`, which travel in one packet, what is in none arrives
+            at once; `state_keys` of the values on their way and of their mask, each `(*batch,
+            max_delay, obs)`, by default `delayed_observation` and `delayed_observed` beside the
+            first observation; `seed`, `in_keys`, `mask_keys`, `complete_key` as in
+            `ObservationMissingness`.
 
     Raises:
-        ValueError: if a delay is no whole number or negative, `max_delay` is under `delay`, their
-            number is not that of the groups, an index of a group is out of range or in two; when
-            the environment is asked for its specs, also if its `StepCounter` ends episodes before
-            the first reading of a sensor can arrive. Other time limits can't be seen from here.
+        ValueError: if a delay is no whole number or negative, `max_delay` is under `delay`, or
+            their number is not that of the groups; when the environment is asked for its specs,
+            also if its `StepCounter` ends episodes before the first reading of a sensor can arrive.
+            Other time limits can't be seen from here.
 
     Example:
         >>> import torch
@@ -60,40 +59,27 @@ class ObservationDelay(CarriedStateTransform):
         >>> second = late._step(first, TensorDict({"observation": torch.tensor([3.0, 4.0])}))
         >>> first["observed"].any().item(), second["observation"].tolist()
         (False, [1.0, 2.0])
-
-    See also: `torchrl_drbpn.functional.sample_delay`.
     """
 
     role: ClassVar[Role] = "missingness"
     ands_mask: ClassVar[bool] = False
     stream: ClassVar[int] = 5
     state_names: ClassVar[tuple[str, ...]] = ("delayed_observation", "delayed_observed")
+    per_group: ClassVar[tuple[str, ...]] = ("delay", "max_delay")
 
     def __init__(
         self,
-        delay: int | Sequence[int] | Tensor,
+        delay: Steps,
         *,
-        max_delay: int | Sequence[int] | Tensor | None = None,
+        max_delay: Steps | None = None,
         in_order: bool = False,
-        groups: Sequence[Sequence[int]] | None = None,
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
-        state_keys: Keys | None = None,
+        **keys: Unpack[CarriedKeys],
     ) -> None:
-        super().__init__(
-            groups=groups,
-            state_keys=state_keys,
-            seed=seed,
-            in_keys=in_keys,
-            mask_keys=mask_keys,
-            complete_key=complete_key,
-        )
-        self.delay = read_whole(delay, "delay", 0)
-        self.max_delay = self.delay if max_delay is None else read_whole(max_delay, "max_delay", 0)
-        if self.delay.ndim and self.max_delay.ndim:
-            check_count(self.max_delay, "max_delay", len(self.delay))
+        super().__init__(**keys)
+        self.delay = read_steps(delay, "delay", 0)
+        self.max_delay = self.delay if max_delay is None else read_steps(max_delay, "max_delay", 0)
+        if self.delay.ndim:
+            check_count(self.max_delay, "max_delay", len(self.delay), "entry of `delay`")
         if bool((self.max_delay < self.delay).any()):
             raise ValueError(
                 f"`max_delay` must not be under `delay`, got {max_delay!r} and {delay!r}."
@@ -105,11 +91,6 @@ class ObservationDelay(CarriedStateTransform):
 
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         return [((self._places, obs_dim), None), ((self._places, obs_dim), torch.bool)]
-
-    def _check_obs_dim(self, obs_dim: int) -> None:
-        super()._check_obs_dim(obs_dim)
-        check_count(self.delay, "delay", self._count(obs_dim))
-        check_count(self.max_delay, "max_delay", self._count(obs_dim))
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         x, carried = step.observation, self._carried(step)
@@ -138,16 +119,14 @@ class ObservationDelay(CarriedStateTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Enter the observation, its mask, the states and, on request, what was complete."""
         spec = super().transform_observation_spec(observation_spec)
-        env, longest = environment_of(self), int(self.delay.max())
-        while isinstance(env, TransformedEnv):
-            for part in env.transform.modules():
-                steps = part.max_steps if isinstance(part, StepCounter) else None
-                if steps is not None and longest >= steps:
-                    raise ValueError(
-                        f"`delay` must be shorter than an episode, got {longest} steps and "
-                        f"StepCounter(max_steps={steps}): nothing would arrive before its end."
-                    )
-            env = env.base_env
+        longest = int(self.delay.max())
+        for part in chain_of(self):
+            steps = part.max_steps if isinstance(part, StepCounter) else None
+            if steps is not None and longest >= steps:
+                raise ValueError(
+                    f"`delay` must be shorter than an episode, got {longest} steps and "
+                    f"StepCounter(max_steps={steps}): nothing would arrive before its end."
+                )
         return spec
 
 
@@ -157,10 +136,6 @@ class ObservationMultiRate(CarriedStateTransform):
     A reading arrives at the steps $t = \text{phase}, \text{phase} + \text{period}, \dots$ of an
     episode, t = 0 at the reset; between them the sensor is masked. Period 1 is every step.
 
-    How many steps are left until the next reading travels in the tensordict under `state_keys`, so
-    that partial resets and workers hold. A simulator that resets itself inside its step goes on
-    counting in the next episode.
-
     Args:
         period: steps from one reading to the next, 1 or more; a number for all, or one for each
             group (each component, where there are no groups).
@@ -168,17 +143,14 @@ class ObservationMultiRate(CarriedStateTransform):
     Keyword Args:
         phase: step of the first reading, under the period, in the form of `period`; or "random", a
             phase drawn for every group and episode.
-        groups: lists of indices of sensors that deliver together (negative ones count from the
-            end), each index in one list at most; entries in none arrive at every step. None, the
-            default: every entry by itself. Several observation keys count as one vector.
-        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
-        state_keys: where the steps until the next reading are kept, int64 `(*batch, groups)`, 0
-            where one arrives; by default `steps_to_reading` beside the first observation.
+        **keys: `groups` as in `SensorOutages`, what is in none arrives at every step; `state_keys`
+            of the steps until the next reading, int64 `(*batch, groups)`, 0 where one arrives, by
+            default `steps_to_reading` beside the first observation; `seed`, `in_keys`, `mask_keys`,
+            `complete_key` as in `ObservationMissingness`.
 
     Raises:
         ValueError: if a period is no whole number or under 1, a phase is negative or not under its
-            period, their number is not that of the groups, or an index of a group is out of range
-            or in two.
+            period, or their number is not that of the groups.
 
     Example:
         >>> import torch
@@ -194,33 +166,22 @@ class ObservationMultiRate(CarriedStateTransform):
     role: ClassVar[Role] = "missingness"
     stream: ClassVar[int] = 6
     state_names: ClassVar[tuple[str, ...]] = ("steps_to_reading",)
+    per_group: ClassVar[tuple[str, ...]] = ("period", "phase")
 
     def __init__(
         self,
-        period: int | Sequence[int] | Tensor,
+        period: Steps,
         *,
-        phase: int | Sequence[int] | Tensor | Literal["random"] = 0,
-        groups: Sequence[Sequence[int]] | None = None,
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
-        state_keys: Keys | None = None,
+        phase: Steps | Literal["random"] = 0,
+        **keys: Unpack[CarriedKeys],
     ) -> None:
-        super().__init__(
-            groups=groups,
-            state_keys=state_keys,
-            seed=seed,
-            in_keys=in_keys,
-            mask_keys=mask_keys,
-            complete_key=complete_key,
-        )
-        self.period = read_whole(period, "period", 1)
+        super().__init__(**keys)
+        self.period = read_steps(period, "period", 1)
         random = isinstance(phase, str) and phase == "random"
-        self.phase = None if random else read_whole(phase, "phase", 0)
+        self.phase = None if random else read_steps(phase, "phase", 0)
         if self.phase is not None:
-            if self.period.ndim and self.phase.ndim:
-                check_count(self.phase, "phase", len(self.period))
+            if self.period.ndim:
+                check_count(self.phase, "phase", len(self.period), "entry of `period`")
             if bool((self.phase >= self.period).any()):
                 raise ValueError(
                     f"`phase` must be under the period, got {phase!r} and period {period!r}."
@@ -228,12 +189,6 @@ class ObservationMultiRate(CarriedStateTransform):
 
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         return [((self._count(obs_dim),), torch.int64)]
-
-    def _check_obs_dim(self, obs_dim: int) -> None:
-        super()._check_obs_dim(obs_dim)
-        check_count(self.period, "period", self._count(obs_dim))
-        if self.phase is not None:
-            check_count(self.phase, "phase", self._count(obs_dim))
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         x, carried = step.observation, self._carried(step)

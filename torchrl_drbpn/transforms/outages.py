@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Unpack
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 
 from torchrl_drbpn.functional.missingness import outage_rates, sample_working
-from torchrl_drbpn.transforms._base import Keys, Role, Step
-from torchrl_drbpn.transforms._carried import CarriedStateTransform
+from torchrl_drbpn.transforms._base import Role, Step
+from torchrl_drbpn.transforms._carried import CarriedStateTransform, GroupedKeys
 
 _INITIAL = ("stationary", "on")
 
@@ -46,14 +45,14 @@ class SensorOutages(CarriedStateTransform):
         mean_length: mean length of an outage in steps, at least 1 and at least eta / (1 - eta).
 
     Keyword Args:
-        groups: lists of indices that fail together (negative ones count from the end), each index
-            in one list at most; entries in none always arrive. None, the default: every entry by
-            itself. Several observation keys count as one vector.
         initial: "stationary" or "on"; the sensors at the start of an episode.
-        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
+        groups: lists of indices of sensors that go together (negative ones count from the end),
+            each index in one list at most; entries in none always arrive. None, the default: every
+            entry by itself.
         state_key: where the state is kept, bool `(*batch, groups)`, True for a group that works; by
             default `sensor_on` beside the first observation. Two `SensorOutages` in one environment
             need two.
+        **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Raises:
         ValueError: if an argument is out of range, `mean_length` is under eta / (1 - eta), or an
@@ -68,7 +67,7 @@ class SensorOutages(CarriedStateTransform):
         >>> bool((observed[:, 0] == observed[:, 1]).all()), bool(observed[:, 3].all())
         (True, True)
 
-    See also: `torchrl_drbpn.functional.outage_rates`, `sample_working`.
+    See also: `torchrl_drbpn.functional.outage_rates`.
     """
 
     role: ClassVar[Role] = "missingness"
@@ -81,22 +80,11 @@ class SensorOutages(CarriedStateTransform):
         eta: float,
         mean_length: float,
         *,
-        groups: Sequence[Sequence[int]] | None = None,
         initial: Literal["stationary", "on"] = "stationary",
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
         state_key: NestedKey | None = None,
+        **keys: Unpack[GroupedKeys],
     ) -> None:
-        super().__init__(
-            groups=groups,
-            state_keys=state_key,
-            seed=seed,
-            in_keys=in_keys,
-            mask_keys=mask_keys,
-            complete_key=complete_key,
-        )
+        super().__init__(state_keys=state_key, **keys)
         self.rates = outage_rates(eta, mean_length)
         self.eta, self.mean_length = float(eta), float(mean_length)
         if initial not in _INITIAL:

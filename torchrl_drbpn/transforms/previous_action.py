@@ -13,7 +13,6 @@ from torchrl_drbpn.transforms._base import (
     Keys,
     as_key_list,
     flagged_rows,
-    last_name,
     mask_like,
     pair_keys,
     read_leaf,
@@ -65,7 +64,7 @@ class PreviousAction(EnvironmentTransform):
         self.one_hot = one_hot
         # What travels from the way in to the way out, where earlier action transforms have
         # overwritten the action: one entry per action, never seen outside a step.
-        self._chosen = [sibling_key(key, f"_chosen_{last_name(key)}") for key in inputs]
+        self._chosen = [sibling_key(key, "_chosen_{}") for key in inputs]
         # specs are slow to ask and short episodes reset often
         self._leaves: dict[NestedKey, TensorSpec] = {}
 

@@ -6,14 +6,19 @@ import multiprocessing
 import os
 import warnings
 import zlib
+from functools import reduce
 from numbers import Integral
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
-from torchrl_drbpn.transforms._base import CorruptingTransform, EnvironmentTransform
+from torchrl_drbpn.transforms._base import (
+    CorruptingTransform,
+    CorruptionKeys,
+    EnvironmentTransform,
+)
 
 _SEED_BITS = 63
 _EXTRA = "_extra_state"
@@ -58,6 +63,12 @@ def _separate_worker() -> None:
 
 
 # ------------------------------------------------------------------------------------ transform
+class SeededKeys(CorruptionKeys, total=False):
+    """And the seed of those that draw."""
+
+    seed: int | None
+
+
 class SeededTransform(EnvironmentTransform, CorruptingTransform):
     """A corrupting transform that draws.
 
@@ -71,7 +82,7 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
     # one number a class, so that noise and missingness with the same seed are not correlated
     stream: ClassVar[int]
 
-    def __init__(self, *, seed: int | None, **keys: Any) -> None:
+    def __init__(self, *, seed: int | None = None, **keys: Unpack[CorruptionKeys]) -> None:
         super().__init__(**keys)
         self.set_seed(seed)
         if seed is None:
@@ -143,23 +154,17 @@ def seed_env(env: EnvBase, seed: int) -> int | None:
 
     Args:
         env: the environment; batched ones are started.
-        seed: the seed, not negative.
+        seed: a TypeError where it is no integer, a ValueError where it is negative.
 
     Returns:
         What `env.set_seed` returns: a seed for the next environment.
-
-    Raises:
-        TypeError: if `seed` is no integer.
-        ValueError: if it is negative.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from torchrl_drbpn.transforms import ObservationNoise
         >>> env = TransformedEnv(GymEnv("InvertedPendulum-v5"), ObservationNoise(0.1))
-        >>> def first():
-        ...     seed_env(env, 3)
-        ...     return env.reset()["observation"]
-        >>> bool((first() == first()).all())
+        >>> first = [(seed_env(env, 3), env.reset()["observation"])[1] for _ in range(2)]
+        >>> bool((first[0] == first[1]).all())
         True
     """
     seed = check_seed(seed)
@@ -184,18 +189,11 @@ def seed_env(env: EnvBase, seed: int) -> int | None:
                 if last != _EXTRA or not isinstance(value, dict) or "generator" not in value:
                     continue
                 if isinstance(env, ParallelEnv):
-                    _call_in_worker(env, index, path, draw())
+                    # It looks up a chain of attributes in its workers. Its load_state_dict would
+                    # leave a signal behind that the next step takes for its own.
+                    reduce(getattr, [*path, "set_seed"], env[index].transform)(draw())
                 else:
                     value |= {"seed": torch.tensor(draw()), "generator": value["generator"][:0]}
         if isinstance(env, SerialEnv):
             env.load_state_dict(states)
     return next_seed
-
-
-def _call_in_worker(env: ParallelEnv, index: int, path: list[str], seed: int) -> None:
-    # ParallelEnv looks up a chain of attributes in its workers. Its load_state_dict would leave a
-    # signal behind that the next step takes for its own.
-    target: Any = env[index].transform
-    for name in [*path, "set_seed"]:
-        target = getattr(target, name)
-    target(seed)

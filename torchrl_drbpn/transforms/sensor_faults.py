@@ -3,28 +3,76 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from numbers import Real
+from typing import ClassVar, Unpack
 
 import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import zero_missing
-from torchrl_drbpn.functional.missingness import sample_noise
-from torchrl_drbpn.transforms._base import Keys, Role, Step
-from torchrl_drbpn.transforms._carried import CarriedStateTransform, Lifecycle, read_lifecycle
-from torchrl_drbpn.transforms.noise import STD, PerComponent
+from torchrl_drbpn.functional.missingness import OutageRates, sample_fault_steps, sample_noise
+from torchrl_drbpn.transforms._base import Role, Step, read_numbers
+from torchrl_drbpn.transforms._carried import CarriedKeys, CarriedStateTransform, read_steps
+from torchrl_drbpn.transforms.noise import NUMBERS, STD, Numbers
 
 
-class _FaultyReadings(CarriedStateTransform):
-    """A transform of readings that are wrong while their sensor has a fault; masks stay."""
+class FaultKeys(CarriedKeys, total=False):
+    """And when faults end."""
+
+    mean_length: float | None
+    duration: int | None
+
+
+class FaultyReadings(CarriedStateTransform):
+    """A transform of readings that are wrong while their sensor has a fault; masks stay.
+
+    Faults begin and end at random (`probability`, `mean_length`) or at a fixed step of every
+    episode (`onset`, 0 for the reset, and `duration`). The first state is an int64 count for each
+    group: how many steps its fault has lasted, this one included; 0 or less while it works. Every
+    group works before an episode begins.
+    """
 
     role: ClassVar[Role] = "noise"
     writes_mask: ClassVar[bool] = False
 
-    def __init__(self, *, lifecycle: Lifecycle, **keys: Any) -> None:
+    def __init__(
+        self,
+        probability: float | None = None,
+        mean_length: float | None = None,
+        *,
+        onset: int | None = None,
+        duration: int | None = None,
+        **keys: Unpack[CarriedKeys],
+    ) -> None:
         super().__init__(**keys)
-        self.lifecycle = lifecycle
+        if (probability is None) == (onset is None):
+            raise ValueError(
+                "`probability` (with `mean_length`) draws when a fault begins, `onset` (with "
+                f"`duration`) fixes it: give one of them, got probability={probability!r} and "
+                f"onset={onset!r}."
+            )
+        self._rates: OutageRates | None = None
+        self._onset, self._last = 0, math.inf
+        if probability is None:
+            if mean_length is not None:
+                raise ValueError(
+                    "`mean_length` goes with `probability`; with `onset` give `duration`."
+                )
+            self._onset = int(read_steps(onset, "onset", 0, several=False))
+            if duration is not None:
+                self._last = float(read_steps(duration, "duration", 1, several=False))
+            return
+        if duration is not None:
+            raise ValueError("`duration` goes with `onset`; with `probability` give `mean_length`.")
+        meaning = "that of a fault to begin at a step, in [0, 1]"
+        begin = read_numbers(probability, "probability", meaning, most=1.0, several=False)
+        length = math.inf if mean_length is None else mean_length
+        if not isinstance(length, Real) or not length >= 1:
+            raise ValueError(
+                "`mean_length` must be the mean length of a fault in steps, at least 1 and "
+                f"infinite for one that never ends, got {mean_length!r}."
+            )
+        self._rates = OutageRates(float(begin), 1.0 / length)
 
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         return [((self._count(obs_dim),), torch.int64), ((obs_dim,), None)]
@@ -33,11 +81,17 @@ class _FaultyReadings(CarriedStateTransform):
         """Return how long faults have lasted, which entries are wrong, and the other state."""
         x, carried = step.observation, self._carried(step)
         before, other = (None, None) if carried is None else carried
-        steps = self.lifecycle.advance(before, self._group_like(x), self.generator(x.device))
-        return steps, self._spread(self.lifecycle.active(steps), x, False), other
+        like = self._group_like(x)
+        if self._rates is not None:
+            steps = sample_fault_steps(before, self._rates, like, self.generator(x.device))
+        elif before is None:
+            steps = torch.full_like(like, 1 - self._onset, dtype=torch.int64)
+        else:
+            steps = before + 1
+        return steps, self._spread((steps > 0) & (steps <= self._last), x, False), other
 
 
-class StuckSensors(_FaultyReadings):
+class StuckSensors(FaultyReadings):
     r"""Let sensors get stuck at their last value: it arrives again and again, as if it were new.
 
     With `probability` a sensor that works gets stuck at a step with this probability and a stuck
@@ -49,10 +103,6 @@ class StuckSensors(_FaultyReadings):
     A sensor is stuck at what it showed the step before, noise and other errors of transforms before
     this one included; at 0 where nothing of it has arrived yet.
 
-    How long each sensor has been stuck, and at what, travels in the tensordict under `state_keys`,
-    so that partial resets and workers hold, and evaluations can look; no policy should read it. A
-    simulator that resets itself inside its step carries faults over to the next episode.
-
     Args:
         probability: that a working sensor gets stuck at a step, in [0, 1].
         mean_length: mean time that a sensor is stuck, steps, at least 1; None: for good.
@@ -61,17 +111,16 @@ class StuckSensors(_FaultyReadings):
         onset: in the place of `probability`: the step of every episode at which sensors get stuck,
             0 or more; at the reset, 0, they show one reading and keep to it.
         duration: in the place of `mean_length`: for how many steps, 1 or more; None: for good.
-        groups: lists of indices of sensors that get stuck together (negative ones count from the
-            end), each index in one list at most; entries in none never do. None, the default: every
-            entry by itself. Several observation keys count as one vector.
-        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
         state_keys: where the state is kept: the steps that a fault has lasted, int64 `(*batch,
             groups)`, 0 or less for a sensor that works, and what each shows, `(*batch, obs)`; by
-            default `stuck_steps` and `stuck_observation` beside the first observation.
+            default `stuck_steps` and `stuck_observation` beside the first observation. Evaluations
+            can look; no policy should read it.
+        **keys: `groups` as in `SensorOutages`; what is in none never gets stuck. `seed`, `in_keys`,
+            `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Raises:
-        ValueError: if neither or both of `probability` and `onset` are given, one is out of range,
-            or an index of a group is out of range or in two.
+        ValueError: if neither or both of `probability` and `onset` are given, or one is out of
+            range.
 
     Example:
         >>> import torch
@@ -80,36 +129,10 @@ class StuckSensors(_FaultyReadings):
         >>> first = stuck._reset(None, TensorDict({"observation": torch.tensor([1.0, 2.0])}))
         >>> stuck._step(first, TensorDict({"observation": torch.tensor([3.0, 4.0])}))["observation"]
         tensor([1., 4.])
-
-    See also: `torchrl_drbpn.functional.sample_fault_steps`.
     """
 
     stream: ClassVar[int] = 7
     state_names: ClassVar[tuple[str, ...]] = ("stuck_steps", "stuck_observation")
-
-    def __init__(
-        self,
-        probability: float | None = None,
-        mean_length: float | None = None,
-        *,
-        onset: int | None = None,
-        duration: int | None = None,
-        groups: Sequence[Sequence[int]] | None = None,
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
-        state_keys: Keys | None = None,
-    ) -> None:
-        super().__init__(
-            lifecycle=read_lifecycle(probability, mean_length, onset, duration),
-            groups=groups,
-            state_keys=state_keys,
-            seed=seed,
-            in_keys=in_keys,
-            mask_keys=mask_keys,
-            complete_key=complete_key,
-        )
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         steps, faulty, last = self._faulty(step)
@@ -124,7 +147,7 @@ class StuckSensors(_FaultyReadings):
         return shown.clone(), None
 
 
-class SensorDrift(_FaultyReadings):
+class SensorDrift(FaultyReadings):
     r"""Add a bias to readings that grows from step to step: a ramp, a random walk, or both.
 
     $\tilde x_t = x_t + b_t, \quad b_t = b_{t-1} + \text{rate} + \text{walk\_std}\, \epsilon_t,
@@ -137,35 +160,27 @@ class SensorDrift(_FaultyReadings):
     drifts begin and end at random as the faults of `StuckSensors` do.
 
     A drifting reading arrives: its mask stays True. Entries that a mask hides stay 0 while the bias
-    goes on growing. The state travels in the tensordict under `state_keys`, so that partial resets
-    and workers hold, and evaluations can look; no policy should read it. A simulator that resets
-    itself inside its step carries the bias over to the next episode.
+    goes on growing.
 
     Args:
         walk_std: standard deviation of a step of the walk, observation units; a number, or one per
             component, shape `(obs,)`.
-        rate: growth of the ramp a step, observation units, of either sign; a number, or one per
-            component, shape `(obs,)`.
+        rate: growth of the ramp a step, observation units, of either sign, likewise.
 
     Keyword Args:
         probability: that a sensor begins to drift at a step, in [0, 1]; None, the default: `onset`.
-        mean_length: mean time that it drifts, steps, at least 1; None: to the end of the episode.
-        onset: the step of every episode at which sensors begin to drift, 0 or more; None, the
-            default, is 0, the reset, where there is no `probability`.
-        duration: with `onset`: for how many steps, 1 or more; None: to the end of the episode.
-        groups: lists of indices of sensors that begin and cease to drift together (negative ones
-            count from the end), each with a bias of its own, each index in one list at most;
-            entries in none never do. None, the default: every entry by itself. Several observation
-            keys count as one vector.
-        seed, in_keys, mask_keys, complete_key: as in `ObservationMissingness`.
-        state_keys: where the state is kept: the steps that a sensor has drifted, int64 `(*batch,
-            groups)`, 0 or less for one that does not, and the bias, `(*batch, obs)`; by default
-            `drift_steps` and `drift_bias` beside the first observation.
+        onset: the step of every episode at which sensors begin to drift; None, the default, is 0,
+            the reset, where there is no `probability`.
+        **keys: `mean_length`, `duration` as in `StuckSensors`; `groups` as in `SensorOutages`, each
+            component with a bias of its own, what is in none never drifts; `state_keys` of the
+            steps that a sensor has drifted, int64 `(*batch, groups)`, 0 or less for one that does
+            not, and of the bias, `(*batch, obs)`, by default `drift_steps` and `drift_bias` beside
+            the first observation; `seed`, `in_keys`, `mask_keys`, `complete_key` as in
+            `ObservationMissingness`.
 
     Raises:
-        ValueError: if `walk_std` is negative or not finite, `rate` is not finite, their number is
-            not that of the components, both `probability` and `onset` are given, one is out of
-            range, or an index of a group is out of range or in two.
+        ValueError: if a number is out of range, the number of `walk_std` or `rate` is not that of
+            the components, or both `probability` and `onset` are given.
 
     Example:
         >>> import torch
@@ -176,49 +191,30 @@ class SensorDrift(_FaultyReadings):
         tensor([0., 1.])
     """
 
+    per_component: ClassVar[tuple[str, ...]] = ("walk_std", "rate")
     stream: ClassVar[int] = 8
     state_names: ClassVar[tuple[str, ...]] = ("drift_steps", "drift_bias")
 
     def __init__(
         self,
-        walk_std: float | Sequence[float] | Tensor = 0.0,
-        rate: float | Sequence[float] | Tensor = 0.0,
+        walk_std: Numbers = 0.0,
+        rate: Numbers = 0.0,
         *,
         probability: float | None = None,
-        mean_length: float | None = None,
         onset: int | None = None,
-        duration: int | None = None,
-        groups: Sequence[Sequence[int]] | None = None,
-        seed: int | None = None,
-        in_keys: Keys = ("observation",),
-        mask_keys: Keys | None = None,
-        complete_key: Keys | None = None,
-        state_keys: Keys | None = None,
+        **keys: Unpack[FaultKeys],
     ) -> None:
         if probability is None and onset is None:
             onset = 0
-        super().__init__(
-            lifecycle=read_lifecycle(probability, mean_length, onset, duration),
-            groups=groups,
-            state_keys=state_keys,
-            seed=seed,
-            in_keys=in_keys,
-            mask_keys=mask_keys,
-            complete_key=complete_key,
-        )
-        self._walk_std = PerComponent(walk_std, "walk_std", STD)
-        self._rate = PerComponent(rate, "rate", "finite, observation units", least=-math.inf)
-
-    def _check_obs_dim(self, obs_dim: int) -> None:
-        super()._check_obs_dim(obs_dim)
-        self._walk_std.check_obs_dim(obs_dim)
-        self._rate.check_obs_dim(obs_dim)
+        super().__init__(probability, onset=onset, **keys)
+        self.walk_std = read_numbers(walk_std, "walk_std", STD)
+        meaning = f"{NUMBERS}, finite, in observation units"
+        self.rate = read_numbers(rate, "rate", meaning, least=-math.inf)
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         x = step.observation
         steps, faulty, bias = self._faulty(step)
-        growth = sample_noise(self._walk_std.like(x), x, self.generator(x.device))
-        growth = growth + self._rate.like(x)
+        growth = sample_noise(self.walk_std.to(x), x, self.generator(x.device)) + self.rate.to(x)
         grown = growth if bias is None else bias + growth
         bias = grown.masked_fill(~faulty, 0.0)
         self._carry(step, steps, bias)
