@@ -75,7 +75,11 @@ def decisions(training: Any, rows: int, folder: Path | None) -> dict[str, Callab
     if folder is not None:
         logging.getLogger("torch._inductor").setLevel(logging.ERROR)
         path = str(folder / f"policy_{rows}.pt2")
-        package = torch._inductor.aoti_compile_and_package(exported, package_path=path)
+        package = torch._inductor.aoti_compile_and_package(
+            exported,
+            package_path=path,
+            inductor_configs={"freezing": True, "max_autotune": True},
+        )
         plain["AOTInductor"] = torch._inductor.aoti_load_package(package)
     expected = agent.policy(source.copy()).get("action")
     for call in plain.values():

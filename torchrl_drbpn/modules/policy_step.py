@@ -25,7 +25,8 @@ class PolicyStep(nn.Module):
     A frozen copy of the policy's modules, one step at a time, with the mean action. What the
     parameters alone determine is computed once, here, and kept in buffers. It has no TensorDict
     and no branch on values, so ``torch.export.export`` takes it, with a dynamic batch too, and
-    ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time.
+    ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time; its ``inductor_configs``
+    "freezing" and "max_autotune" together compile the matrix products too.
 
     Args:
         belief: the belief module; its ``gate`` is kept.
@@ -90,6 +91,10 @@ class PolicyStep(nn.Module):
         self.matrix, self.noise, self.prior = nn.Buffer(H), nn.Buffer(R), nn.Buffer(P)
         self.cross, self.innovation_cov = nn.Buffer(H @ P), nn.Buffer(H @ P @ H.mT + R)
         self.eye = nn.Buffer(torch.eye(len(H)).to(H))
+        # H m + B a + d as one product with (m, a).
+        affine = torch.cat([model.emission_matrix, model.action_matrix], -1)
+        self.expectation = nn.Buffer(affine.clone())
+        self.offset = nn.Buffer(model.emission_offset.clone())
         if self.information:
             self.precision, self.weight = nn.Buffer(P.inverse()), nn.Buffer(1 / R.diagonal())
             self.outer = nn.Buffer((H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2))
@@ -156,7 +161,10 @@ class PolicyStep(nn.Module):
         else:
             moved, cov = filter.transition(mean, previous_action)
         m = torch.where(is_init, filter.initial_mean, moved)
-        expected, wants_cov = filter.emission(m, previous_action), self.policy_input == "mean_cov"
+        wants_cov = self.policy_input == "mean_cov"
+        # A product and a sum, not a matmul: Inductor fuses it with what surrounds it.
+        cause = torch.cat([m, previous_action], -1).unsqueeze(-2)
+        expected = (self.expectation * cause).sum(-1) + self.offset
         if cov is not None:
             P = torch.where(first, self.prior[1], cov.to(H.dtype))
             cross = H @ P
