@@ -50,3 +50,9 @@ def case(state: int, obs: int, *, seed: int = 0, batch: int = 5, full_noise: boo
 def some_masks(batch: int, obs: int, generator: torch.Generator) -> Tensor:
     kinds = [PATTERNS[i % len(PATTERNS)] for i in range(batch)]
     return torch.stack([pattern(kind, obs, generator) for kind in kinds])
+
+
+def given(state: int, obs: int, **kwargs):
+    """The arguments of one step, whose rows observe one entry, all, some and none; a generator."""
+    system, belief, x, offset, g = case(state, obs, **kwargs)
+    return (belief, x, some_masks(len(x), obs, g), system.matrix, system.noise, offset), g
