@@ -7,19 +7,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import (
-    Bounded,
-    Categorical,
-    Composite,
-    Unbounded,
-)
-from torchrl.envs import (
-    DoubleToFloat,
-    EnvBase,
-    GymEnv,
-    ParallelEnv,
-    TransformedEnv,
-)
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, ParallelEnv, TransformedEnv
 
 OBS, ACTION = 5, 2
 
@@ -48,16 +37,10 @@ class StaircaseEnv(EnvBase):
         self.ramp = torch.arange(obs, dtype=dtype) / 10 + 100.0 * torch.arange(batch)[:, None]
 
     def _observe(self) -> TensorDict:
-        observation = self.ramp + self.time[:, None]
+        observation = (self.ramp + self.time[:, None]).to(self.ramp.dtype)
         done = (self.time >= self.last)[:, None]
-        return TensorDict(
-            {
-                "observation": observation.to(self.ramp.dtype),
-                "done": done,
-                "terminated": done.clone(),
-            },
-            self.batch_size,
-        )
+        entries = {"observation": observation, "done": done, "terminated": done.clone()}
+        return TensorDict(entries, self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         del kwargs

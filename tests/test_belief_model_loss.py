@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torchrl_drbpn import BeliefModelLoss
 
 OBS, BATCH, TIME = 4, 3, 5
+MASK = r"`observed` must be bool of shape \(\*batch, obs\)"
 
 
 def make_data(dtype: torch.dtype = torch.float32, seed: int = 0) -> TensorDict:
@@ -78,15 +79,14 @@ def test_it_is_minus_the_sum_over_what_arrived(normalize):
     assert not out["log_likelihood"].requires_grad
 
 
-def test_sum_and_none_are_in_nats_whatever_the_normalisation():
+@pytest.mark.parametrize("normalize", ["entry", "step"])
+def test_sum_and_none_are_in_nats_whatever_the_normalisation(normalize):
     data = make_data(torch.float64)
     total, *_ = counted(data)
-    for normalize in ("entry", "step"):
-        value = BeliefModelLoss(normalize=normalize, reduction="sum")(data)["loss_model"]
-        torch.testing.assert_close(value, -total, rtol=1e-12, atol=0)
-        each = BeliefModelLoss(normalize=normalize, reduction="none")(data)["loss_model"]
-        assert each.shape == data.shape
-        torch.testing.assert_close(each.sum(), -total, rtol=1e-12, atol=1e-12)
+    for reduction in ("sum", "none"):
+        value = BeliefModelLoss(normalize=normalize, reduction=reduction)(data)["loss_model"]
+        assert value.shape == (data.shape if reduction == "none" else ())
+        torch.testing.assert_close(value.sum(), -total, rtol=1e-12, atol=1e-12)
 
 
 def test_without_next_likelihoods_the_root_steps_count_alone():
@@ -108,13 +108,8 @@ def test_a_step_that_is_done_and_final_counts_its_next_observation_once():
 @pytest.mark.parametrize("reduction", ["mean", "sum"])
 def test_nothing_observed_at_all_is_a_finite_zero(normalize, reduction):
     ll = torch.zeros(2, 3, requires_grad=True)
-    data = TensorDict(
-        {
-            ("belief", "log_likelihood"): ll * 1.0,
-            "observed": torch.zeros(2, 3, OBS, dtype=torch.bool),
-        },
-        [2, 3],
-    )
+    nothing = torch.zeros(2, 3, OBS, dtype=torch.bool)
+    data = TensorDict({("belief", "log_likelihood"): ll * 1.0, "observed": nothing}, [2, 3])
     out = BeliefModelLoss(normalize=normalize, reduction=reduction)(data)
     assert out["loss_model"] == 0
     assert out["log_likelihood"] == 0
@@ -165,28 +160,19 @@ def test_an_end_that_a_sampler_of_single_steps_wrote_is_not_believed():
 
 
 # ---------------------------------------------------------------------------------------- bad input
+
+
 @pytest.mark.parametrize(
-    ("kwargs", "message"),
+    ("kwargs", "change", "error", "message"),
     [
-        ({"normalize": "batch"}, "`normalize` must be 'entry' or 'step', got 'batch'"),
-        ({"reduction": "max"}, "`reduction` must be 'none', 'mean' or 'sum', got 'max'"),
+        ({"normalize": "batch"}, None, ValueError, "`normalize` must be 'entry' or 'step', got 'b"),
+        ({"reduction": "max"}, None, ValueError, "`reduction` must be 'none', 'mean' or 'sum'"),
+        ({}, lambda d: d.exclude("observed"), KeyError, "not in .*: run the belief module on it"),
+        ({}, lambda d: d.exclude("belief"), KeyError, "not in .*: run the belief module on it"),
+        ({}, lambda d: d.set("observed", d["observed"].float()), ValueError, MASK),
+        ({}, lambda d: d.set("observed", d["observed"][..., 0]), ValueError, MASK),
     ],
-)
-def test_an_unknown_choice_is_refused(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        BeliefModelLoss(**kwargs)
-
-
-@pytest.mark.parametrize("absent", [("belief", "log_likelihood"), "observed"])
-def test_an_absent_entry_is_named_with_what_to_do(absent):
-    with pytest.raises(KeyError, match="is not in the tensordict: run the belief module on it"):
-        BeliefModelLoss()(make_data().exclude(absent))
-
-
-@pytest.mark.parametrize(
-    "observed", [torch.ones(BATCH, TIME, OBS), torch.ones(BATCH, TIME, dtype=torch.bool)]
-)
-def test_a_mask_of_wrong_dtype_or_shape_is_refused(observed):
-    data = make_data().set("observed", observed)
-    with pytest.raises(ValueError, match=r"`observed` must be bool of shape \(\*batch, obs\)"):
-        BeliefModelLoss()(data)
+)  # fmt: skip
+def test_bad_use_is_one_clear_line(kwargs, change, error, message):
+    with pytest.raises(error, match=message):
+        BeliefModelLoss(**kwargs)(change(make_data()))

@@ -82,16 +82,11 @@ def both(env_id, n, **kwargs):
 
 
 @pytest.mark.parametrize("env_id", TASKS)
-def test_specs_and_time_limit_are_those_of_gymnasium(env_id):
-    pool, gym = EnvPoolBatchEnv(env_id, 2), GymnasiumBatchEnv(env_id, 2)
+def test_specs_time_limit_and_first_observations_are_those_of_gymnasium(env_id):
+    pool, gym, start, _ = both(env_id, 4)
     for name in ("observation_spec", "action_spec", "reward_spec", "done_spec"):
         assert getattr(pool, name) == getattr(gym, name)
     assert pool.max_episode_steps == gym.max_episode_steps
-
-
-@pytest.mark.parametrize("env_id", TASKS)
-def test_the_first_observation_is_gymnasiums_of_the_same_state(env_id):
-    _, gym, start, _ = both(env_id, 4)
     for sim, observation in zip(gym.envs, start["observation"].numpy(), strict=True):
         np.testing.assert_allclose(sim._get_obs(), observation, rtol=0, atol=1e-12)
 
@@ -200,26 +195,37 @@ def test_random_episodes_are_as_long_and_as_good_as_gymnasiums(env_id):
 
 
 def test_an_episode_that_terminates_on_the_last_step_of_the_limit_does_both():
-    env = EnvPoolBatchEnv("InvertedPendulum-v5", 1, seed=0)
-    push = torch.full((1, 1, 1), 3.0).repeat(60, 1, 1)
-    seen, _ = play(env, env.reset(), push)
-    length = int(seen[:, 0, 5].nonzero()[0]) + 1
-    env = EnvPoolBatchEnv("InvertedPendulum-v5", 1, seed=0, max_episode_steps=length)
-    seen, _ = play(env, env.reset(), push[:length])
+    push, length = torch.full((60, 1, 1), 3.0), 60
+    for _ in range(2):  # the second time with the limit on the step of the termination
+        env = EnvPoolBatchEnv("InvertedPendulum-v5", 1, seed=0, max_episode_steps=length)
+        seen, _ = play(env, env.reset(), push[:length])
+        length = int(seen[:, 0, 5].nonzero()[0]) + 1
     assert seen[:-1, 0, 5:7].sum() == 0
     assert seen[-1, 0, 5:7].tolist() == [1.0, 1.0]
 
 
-def test_minus_one_takes_the_limit_off_and_a_truncated_row_may_be_stepped_on():
-    env = EnvPoolBatchEnv("Reacher-v4", 1, seed=0, max_episode_steps=-1)
-    assert env.rollout(60).shape == (1, 60)
+def test_a_truncated_row_may_be_stepped_on():
     env = EnvPoolBatchEnv("Reacher-v4", 1, seed=0, max_episode_steps=2)
-    root = env.reset().set("action", torch.zeros(1, 2))
-    done = []
+    root, done = env.reset(), []
     for _ in range(4):
-        root = env.step(root)["next"].set("action", torch.zeros(1, 2))
+        root = env.step(root.set("action", torch.zeros(1, 2)))["next"]
         done.append(root["truncated"].item())
     assert done == [False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("use", "error", "match"),
+    [
+        (lambda: EnvPoolBatchEnv("CartPole-v1", 1), ValueError, "action space .* got Discrete"),
+        (lambda: EnvPoolBatchEnv("CheetahRun-v1", 1), ValueError, "observation space .* got Dict"),
+        (lambda: EnvPoolBatchEnv("Swimmer-v5", 1, render_mode="rgb_array"), TypeError,
+         r"takes no \['render_mode'\]"),
+        (lambda: EnvPoolBatchEnv("Swimmer-v5", 1).reset(options={"x": 1}), ValueError, "no `opti"),
+    ],
+)  # fmt: skip
+def test_what_envpool_does_not_have_is_refused(use, error, match):
+    with pytest.raises(error, match=match):
+        use()
 
 
 def test_stepping_on_after_a_termination_is_refused_rather_than_a_new_episode():
@@ -253,11 +259,6 @@ def test_a_seed_is_used_once_and_asks_for_a_reset_of_every_row():
     torch.testing.assert_close(env.reset(seed=0)["observation"], first, rtol=0, atol=0)
 
 
-def test_options_of_a_reset_are_refused():
-    with pytest.raises(ValueError, match="no `options`"):
-        EnvPoolBatchEnv("Swimmer-v5", 1).reset(options={"x": 1})
-
-
 # Saving ----------------------------------------------------------------------------------------
 
 
@@ -286,23 +287,3 @@ def test_a_copy_starts_new_episodes_and_leaves_the_original_alone(duplicate):
     twin.reset()
     rest, _ = play(env, root, actions[10:])
     torch.testing.assert_close(torch.cat([first, rest]), expected, rtol=0, atol=0)
-
-
-# Errors ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("env_id", "match"),
-    [
-        ("CartPole-v1", r"action space .* got Discrete"),
-        ("CheetahRun-v1", "observation space .* got Dict"),
-    ],
-)
-def test_tasks_that_are_not_vectors_are_refused(env_id, match):
-    with pytest.raises(ValueError, match=match):
-        EnvPoolBatchEnv(env_id, 1)
-
-
-def test_keywords_of_gymnasium_make_are_refused():
-    with pytest.raises(TypeError, match=r"takes no \['render_mode'\]"):
-        EnvPoolBatchEnv("Swimmer-v5", 1, render_mode="rgb_array")

@@ -228,7 +228,8 @@ def test_a_float32_covariance_is_not_inflated(std):
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_a_float32_step_is_near_float64(state, obs):
     (belief, x, observed, *model), _ = given(state, obs)
-    narrow = (Belief(*(t.float() for t in belief)), x.float(), observed, *(t.float() for t in model))
+    single = Belief(*(t.float() for t in belief))
+    narrow = (single, x.float(), observed, *(t.float() for t in model))
     truth = (belief, x, observed, *model)
     for a, b in zip(F.update(*narrow), F.update(*truth), strict=True):
         assert a.dtype == torch.float32

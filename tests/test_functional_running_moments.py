@@ -5,6 +5,8 @@ ones are deleted; merging in any order and grouping; no loss of precision where 
 nothing observed changes nothing; a wild reading is moved to a bound and the others are not.
 """
 
+import functools
+
 import pytest
 import torch
 
@@ -48,34 +50,15 @@ def test_masked_moments_are_those_of_the_observed_values_alone(seed):
 def test_merging_gives_the_same_in_any_order_and_grouping(seed):
     value, observed = draw(97, 3, seed)
     whole = masked_moments(value, observed)
-    generator = torch.Generator().manual_seed(seed)
-    sizes = [1, 40, 7, 2, 47]
-    batches = [
-        masked_moments(*pair)
-        for pair in zip(value.split(sizes), observed.split(sizes), strict=True)
-    ]
-    for _ in range(5):
-        order = torch.randperm(5, generator=generator).tolist()
-        merged = nothing()
-        for index in order:
-            merged = merge_moments(merged, batches[index])
-        right = merge_moments(batches[order[3]], batches[order[4]])
-        tree = merge_moments(
-            merge_moments(batches[order[0]], batches[order[1]]),
-            merge_moments(batches[order[2]], right),
-        )
-        for other in (merged, tree):
-            for a, b in zip(other, whole, strict=True):
-                torch.testing.assert_close(a, b, **TIGHT)
-
-
-def test_merging_with_nothing_observed_changes_nothing():
-    value, observed = draw(20, 3)
-    moments = masked_moments(value, observed)
+    parts = (x.split([1, 40, 7, 2, 47]) for x in (value, observed))
+    batches = [masked_moments(*pair) for pair in zip(*parts, strict=True)]
+    a, b, c, d, e = (batches[i] for i in torch.randperm(5).tolist())
     unseen = masked_moments(value, torch.zeros_like(observed))
-    for merged in (merge_moments(moments, unseen), merge_moments(unseen, moments)):
-        for a, b in zip(merged, moments, strict=True):
-            assert torch.equal(a, b)
+    left = functools.reduce(merge_moments, (nothing(), a, b, unseen, c, d, e))
+    tree = merge_moments(merge_moments(merge_moments(a, b), c), merge_moments(d, e))
+    for one, other, expected in zip(left, tree, whole, strict=True):
+        torch.testing.assert_close(one, expected, **TIGHT)
+        torch.testing.assert_close(other, expected, **TIGHT)
 
 
 def test_a_mean_far_larger_than_the_spread_costs_no_precision():
@@ -95,13 +78,10 @@ def test_with_fewer_than_two_values_the_spread_is_one(seen):
     assert spread(masked_moments(value, observed), EPS).item() == 1.0
 
 
-@pytest.mark.parametrize("mask", [torch.ones(4, 2), torch.ones(4).bool()], ids=["dtype", "shape"])
-def test_a_mask_of_wrong_dtype_or_shape_is_refused(mask):
-    with pytest.raises(ValueError, match="`observed` must be bool of the shape"):
-        masked_moments(torch.zeros(4, 2), mask)
-
-
-def test_moments_of_other_sensors_are_not_merged():
+def test_other_masks_and_sensors_are_refused():
+    for mask in (torch.ones(4, 2), torch.ones(4).bool()):
+        with pytest.raises(ValueError, match="`observed` must be bool of the shape"):
+            masked_moments(torch.zeros(4, 2), mask)
     with pytest.raises(ValueError, match=r"one shape \(\*event\), got \[\(2,\), \(3,\)\]"):
         merge_moments(nothing(2), nothing(3))
 

@@ -8,7 +8,6 @@ whose physics engine resets itself is counted and ends its episode.
 from __future__ import annotations
 
 import copy
-import io
 import pickle
 import sys
 from functools import partial
@@ -17,7 +16,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from contracts import parallel_env
+from contracts import parallel_env, saved
 from env_tools import TASKS, play, random_actions
 from gymnasium import spaces
 from torchrl.envs import check_env_specs
@@ -76,14 +75,19 @@ class Counter(gymnasium.Env):
 
 @pytest.mark.parametrize("env_id", TASKS)
 def test_trajectories_are_those_of_gymnasium_to_the_last_bit(env_id):
-    steps, n, limit = 60, 2, 25
-    env = GymnasiumBatchEnv(env_id, n, seed=3, dtype=torch.float64, max_episode_steps=limit)
+    steps, n, kwargs = 60, 2, {"max_episode_steps": 25}
+    env, single = (
+        GymnasiumBatchEnv(env_id, n, seed=3, dtype=dtype, **kwargs)
+        for dtype in (torch.float64, torch.float32)
+    )
     actions = random_actions(env, steps, scale=1.5)
     tensordict = env.reset()
     seen, _ = play(env, tensordict.clone(), actions)
+    rounded, _ = play(single, single.reset(), actions)
+    torch.testing.assert_close(rounded, seen.float().double(), rtol=0, atol=0)
 
     for row, seed in enumerate(np.random.SeedSequence(3).generate_state(n)):
-        by_hand = gymnasium.make(env_id, max_episode_steps=limit)
+        by_hand = gymnasium.make(env_id, **kwargs)
         space = by_hand.action_space
         observation, _ = by_hand.reset(seed=int(seed))
         np.testing.assert_array_equal(tensordict["observation"][row], observation)
@@ -93,17 +97,6 @@ def test_trajectories_are_those_of_gymnasium_to_the_last_bit(env_id):
             after = by_hand.reset()[0] if terminated or truncated else observation
             expected = np.concatenate([observation, [reward, terminated, truncated], after])
             np.testing.assert_array_equal(seen[step, row], expected)
-
-
-def test_float32_is_the_rounded_float64():
-    single, double = (
-        GymnasiumBatchEnv("Walker2d-v5", 2, seed=0, dtype=dtype)
-        for dtype in (torch.float32, torch.float64)
-    )
-    actions = random_actions(single, 20)
-    low, _ = play(single, single.reset(), actions)
-    high, _ = play(double, double.reset(), actions)
-    torch.testing.assert_close(low, high.float().double(), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -191,6 +184,7 @@ def test_making_writes_no_log_file_and_logs_each_model_warning_once(tmp_path, ca
         ("step", "raised in `step` after 2 steps .*ZeroDivisionError: a joint has no mass"),
         ("nan", "returned the reward nan in `step` after 2 steps"),
         ("inf", "returned the reward inf in `step` after 2 steps"),
+        ("reset", "raised in `reset` after 0 steps .*: OSError: the cable is out$"),
     ],
 )
 def test_a_simulator_that_fails_is_named_with_its_step_in_one_line(register, threads, fails, match):
@@ -199,14 +193,6 @@ def test_a_simulator_that_fails_is_named_with_its_step_in_one_line(register, thr
     with pytest.raises(SimulatorError, match=f"environment 2 of 3 x `ForTest-v0` {match}") as error:
         env.rollout(5)
     assert "\n" not in str(error.value)
-
-
-def test_a_simulator_that_fails_in_reset_is_named_in_one_line(register):
-    env = GymnasiumBatchEnv(register(Counter), 2)
-    env.envs[1].unwrapped.fails = "reset"
-    match = "environment 1 .* raised in `reset` after 0 steps .*: OSError: the cable is out$"
-    with pytest.raises(SimulatorError, match=match):
-        env.reset()
 
 
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "InvertedPendulum-v5"])
@@ -235,45 +221,26 @@ def test_an_engine_that_resets_itself_is_counted_and_ends_the_episode_as_truncat
 # Saving ----------------------------------------------------------------------------------------
 
 
-def through_a_file(state):
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=True)
-
-
 @pytest.mark.parametrize("env_id", TASKS)
 def test_a_restored_run_goes_on_to_the_last_bit_in_a_fresh_object(env_id):
-    kwargs = {"dtype": torch.float64, "max_episode_steps": 70}
-    env = GymnasiumBatchEnv(env_id, 2, seed=0, **kwargs)
+    make = partial(GymnasiumBatchEnv, env_id, 2, dtype=torch.float64, max_episode_steps=70)
+    env, undisturbed = make(seed=0), make(seed=0)
     actions = random_actions(env, 160)
     _, tensordict = play(env, env.reset(), actions[:40])
-    saved, start = through_a_file(env.state_dict()), tensordict.clone()
+    env.envs[0].count = 3  # what a task holds is saved with it
+    state, start = saved(env.state_dict()), tensordict.clone()
     expected, _ = play(env, tensordict, actions[40:])
     assert expected[:, :, -1].isfinite().all()
+    whole, _ = play(undisturbed, undisturbed.reset(), actions)
+    torch.testing.assert_close(whole[40:], expected, rtol=0, atol=0)
 
-    fresh = GymnasiumBatchEnv(env_id, 2, seed=99, **kwargs)
-    play(fresh, fresh.reset(), actions[:7])  # a past of its own must leave no trace
-    fresh.load_state_dict(saved)
-    again, _ = play(fresh, start.clone(), actions[40:])
-    torch.testing.assert_close(again, expected, rtol=0, atol=0)
-
-    never_reset = GymnasiumBatchEnv(env_id, 2, **kwargs)
-    never_reset.load_state_dict(saved)
-    again, _ = play(never_reset, start.clone(), actions[40:80])
-    torch.testing.assert_close(again, expected[:40], rtol=0, atol=0)
-
-
-def test_saving_does_not_disturb_the_run():
-    plain, saved = (GymnasiumBatchEnv("Ant-v5", 2, seed=0) for _ in "ab")
-    actions = random_actions(plain, 20)
-    expected, _ = play(plain, plain.reset(), actions)
-    tensordict, parts = saved.reset(), []
-    for action in actions:
-        part, tensordict = play(saved, tensordict, [action])
-        saved.state_dict()
-        parts.append(part)
-    torch.testing.assert_close(torch.cat(parts), expected, rtol=0, atol=0)
+    with_a_past, never_reset = make(seed=99), make()
+    play(with_a_past, with_a_past.reset(), actions[:7])  # which must leave no trace
+    for fresh in (with_a_past, never_reset):
+        fresh.load_state_dict(state)
+        again, _ = play(fresh, start.clone(), actions[40:])
+        torch.testing.assert_close(again, expected, rtol=0, atol=0)
+        assert fresh.envs[0].count == 3
 
 
 def test_a_pending_seed_is_saved():
@@ -281,18 +248,6 @@ def test_a_pending_seed_is_saved():
     fresh = GymnasiumBatchEnv("Swimmer-v5", 2, seed=1)
     fresh.load_state_dict(env.state_dict())
     torch.testing.assert_close(fresh.reset()["observation"], env.reset()["observation"])
-
-
-def test_numbers_that_a_task_holds_are_saved():
-    env = GymnasiumBatchEnv("Reacher-v5", 1, seed=0)
-    env.reset()
-    env.envs[0].count, env.envs[0].level = 3, np.float64(0.1)
-    fresh = GymnasiumBatchEnv("Reacher-v5", 1)
-    fresh.load_state_dict(through_a_file(env.state_dict()))
-    np.testing.assert_array_equal(fresh.envs[0].goal, env.envs[0].goal)
-    assert fresh.envs[0].count == 3
-    assert isinstance(fresh.envs[0].level, np.float64)
-    assert fresh.envs[0].level == 0.1
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
@@ -306,43 +261,45 @@ def test_a_copy_goes_on_where_the_original_is(duplicate):
     torch.testing.assert_close(again, expected, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(("env_id", "n"), [("Walker2d-v5", 2), ("Hopper-v5", 3)])
-def test_a_foreign_state_is_refused(env_id, n):
-    env = GymnasiumBatchEnv("Hopper-v5", 2, seed=0)
-    env.reset()
-    other = GymnasiumBatchEnv(env_id, n)
-    with pytest.raises(ValueError, match="another environment"):
-        other.load_state_dict(env.state_dict())
-
-
-@pytest.mark.parametrize("key", ["elapsed", "observation", "simulators", "generators"])
-def test_an_incomplete_or_damaged_state_is_refused(key):
-    env = GymnasiumBatchEnv("Hopper-v5", 2, seed=0)
-    env.reset()
-    state = env.state_dict()
+def without(state, key):
     extra = state["_extra_state"]
     if key == "generators":
         extra["simulators"][key] = extra["simulators"][key][:-9]
     else:
         del extra[key]
-    with pytest.raises(ValueError, match=key):
-        env.load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "n", "spoilt", "match"),
+    [
+        ("Walker2d-v5", 2, None, "another environment"),
+        ("Hopper-v5", 3, None, "another environment"),
+        *[("Hopper-v5", 2, key, key) for key in ("elapsed", "observation", "simulators")],
+        ("Hopper-v5", 2, "generators", "generators"),
+    ],
+)
+def test_a_foreign_incomplete_or_damaged_state_is_refused(env_id, n, spoilt, match):
+    env = GymnasiumBatchEnv("Hopper-v5", 2, seed=0)
+    env.reset()
+    state = env.state_dict()
+    if spoilt:
+        without(state, spoilt)
+    with pytest.raises(ValueError, match=match):
+        GymnasiumBatchEnv(env_id, n).load_state_dict(state)
 
 
 def test_a_task_without_mujoco_says_that_it_can_not_be_saved():
-    env = GymnasiumBatchEnv("Pendulum-v1", 2, seed=0)
+    make = partial(GymnasiumBatchEnv, "Pendulum-v1", 3, seed=0)
+    env = make()
     check_env_specs(env)
     assert not env.supports_state
     assert not any(env.state_dict().values())
-    other = GymnasiumBatchEnv("InvertedPendulum-v5", 2, seed=0)
+    other = GymnasiumBatchEnv("InvertedPendulum-v5", 3, seed=0)
     other.reset()
     with pytest.raises(RuntimeError, match=r"can not be restored.*supports_state"):
         env.load_state_dict(other.state_dict())
-
-
-def test_a_task_that_can_not_be_saved_runs_in_parallel_environments():
     # TorchRL asks a shadow of each worker's environment for its state_dict.
-    env = parallel_env(2, partial(GymnasiumBatchEnv, "Pendulum-v1", 3, seed=0))
+    env = parallel_env(2, make)
     try:
         assert env.rollout(3)["observation"].shape == (2, 3, 3, 3)
     finally:

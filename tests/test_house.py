@@ -63,103 +63,63 @@ def imports(file: Path) -> list[tuple[str, str]]:
     return found
 
 
-def inner_target(module: str, name: str) -> str | None:
-    """The room that an import of the package reaches, "" for the package itself, None outside."""
-    parts = module.split(".")
-    if parts[0] != PACKAGE.name:
-        return None
-    if len(parts) > 1:
-        return parts[1]
-    return name if name in ROOMS else ""
-
-
-def outside(file: Path) -> list[tuple[str, str]]:
-    """The imports that are neither of the package nor of the standard library."""
-    return [
-        (module, name)
-        for module, name in imports(file)
-        if module.split(".")[0] not in {*sys.stdlib_module_names, PACKAGE.name, "__future__"}
-    ]
-
-
-def ids(files):
-    return [str(file.relative_to(PACKAGE)) for file in files]
-
-
 def test_every_room_has_a_rule():
     assert set(ROOMS) == set(INNER) == set(OUTER)
 
 
-@pytest.mark.parametrize("file", FILES, ids=ids(FILES))
-def test_a_room_imports_only_what_its_rule_allows(file):
-    room = room_of(file)
-    if not room:  # the package itself gathers all rooms
-        assert not outside(file)
-        return
+def reached(module: str, name: str) -> str | None:
+    """The room that an import of the package reaches, "" for the package itself, None outside."""
+    first, _, rest = module.partition(".")
+    if first != PACKAGE.name:
+        return None
+    return rest.partition(".")[0] or (name if name in ROOMS else "")
+
+
+every_file = pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(PACKAGE)))
+
+
+@every_file
+def test_a_room_imports_only_what_its_rule_allows_and_no_underscore_name(file):
+    room, own = room_of(file), {*sys.stdlib_module_names, PACKAGE.name, "__future__"}
+    foreign = {module.split(".")[0] for module, _ in imports(file)} - own
+    allowed = OUTER[room] if room else set()  # the package itself gathers all rooms
+    assert foreign <= allowed, f"{file}: {room} may not import {foreign - allowed}"
     for module, name in imports(file):
-        target = inner_target(module, name)
-        if target is None:
+        target = reached(module, name)
+        if target is None or target == room:
             continue
         assert target, f"{file}: imports the package itself; import from the room instead"
-        assert target == room or target in INNER[room], f"{file}: {room} may not import {target}"
-    foreign = {module.split(".")[0] for module, _ in outside(file)}
-    assert foreign <= OUTER[room], f"{file}: {room} may not import {foreign - OUTER[room]}"
+        assert not room or target in INNER[room], f"{file}: {room} may not import {target}"
+        private = any(part.startswith("_") for part in (*module.split("."), name))
+        assert not private, f"{file}: {module}.{name}"
 
 
-@pytest.mark.parametrize("file", FILES, ids=ids(FILES))
-def test_no_underscore_name_crosses_a_room(file):
-    for module, name in imports(file):
-        target = inner_target(module, name)
-        if target and target != room_of(file):
-            parts = [*module.split("."), name]
-            assert not any(part.startswith("_") for part in parts), f"{file}: {module}.{name}"
-
-
-@pytest.mark.parametrize("file", FILES, ids=ids(FILES))
-def test_no_file_is_longer_than_the_limit(file):
-    lines = file.read_text().count("\n")
-    assert lines <= LONGEST_FILE, f"{file}: split it"
-
-
-@pytest.mark.parametrize("file", FILES, ids=ids(FILES))
-def test_the_library_neither_prints_nor_asserts_nor_seeds_the_world(file):
-    for node in ast.walk(ast.parse(file.read_text())):
+@every_file
+def test_a_file_says_what_it_is_is_short_and_neither_prints_nor_asserts_nor_seeds_the_world(file):
+    text = file.read_text()
+    tree = ast.parse(text)
+    assert ast.get_docstring(tree)
+    assert text.count("\n") <= LONGEST_FILE, f"{file}: split it"
+    for node in ast.walk(tree):
         if isinstance(node, ast.Assert):  # narrowing a type for mypy is the one use allowed
             narrows = ast.unparse(node.test).startswith("isinstance(")
             assert narrows, f"{file}:{node.lineno}: raise a clear error"
         if isinstance(node, ast.Call):
             called = ast.unparse(node.func)
-            assert called not in {"print", "torch.manual_seed", "np.random.seed", "random.seed"}, (
-                f"{file}:{node.lineno}: {called}"
-            )
-
-
-@pytest.mark.parametrize("file", FILES, ids=ids(FILES))
-def test_every_file_says_what_it_is(file):
-    assert ast.get_docstring(ast.parse(file.read_text()))
+            forbidden = {"print", "torch.manual_seed", "np.random.seed", "random.seed"}
+            assert called not in forbidden, f"{file}:{node.lineno}: {called}"
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_all_of_a_room_lists_what_its_init_imports_in_order(room):
+def test_all_of_a_room_lists_what_its_init_imports_and_the_package_offers_its_classes(room):
     file = PACKAGE / room / "__init__.py"
-    imported = {name for module, name in imports(file) if inner_target(module, name) is not None}
-    listed = importlib.import_module(f"{PACKAGE.name}.{room}").__all__
-    assert imported == set(listed)
-    assert len(listed) == len(set(listed))
-
-
-def test_the_package_offers_every_class_of_its_rooms():
-    package = importlib.import_module(PACKAGE.name)
-    rooms = [importlib.import_module(f"{PACKAGE.name}.{room}") for room in ROOMS]
-    classes = {
-        name
-        for module in rooms
-        for name in module.__all__
-        if inspect.isclass(getattr(module, name)) and module.__name__ != "torchrl_drbpn.functional"
-    }
-    assert classes <= set(package.__all__)
-    assert "functional" in package.__all__
-    assert len(package.__all__) == len(set(package.__all__))
+    imported = {name for module, name in imports(file) if reached(module, name) is not None}
+    module, package = (importlib.import_module(n) for n in (f"{PACKAGE.name}.{room}", PACKAGE.name))
+    assert imported == set(module.__all__)
+    for names in (module.__all__, package.__all__):
+        assert len(names) == len(set(names))
+    classes = {name for name in module.__all__ if inspect.isclass(getattr(module, name))}
+    assert (classes if room != "functional" else {room}) <= set(package.__all__)
 
 
 # An incomplete package must not keep the other rules from being checked.

@@ -72,14 +72,6 @@ def test_a_wrong_size_is_refused(kwargs, message):
         make_filter(**kwargs)
 
 
-def test_a_mask_of_numbers_is_refused():
-    data = make_frames((3, 4))
-    data["observed"] = data["observed"].double()
-    module = ParticleFilterModule(make_filter(dtype=torch.float64))
-    with set_recurrent_mode(True), pytest.raises((ValueError, RuntimeError), match="bool"):
-        module(data)
-
-
 def test_the_model_is_learned_by_the_loss_that_learns_the_belief_filter():
     # a staircase observed through a mask: the bound rises
     with torch.random.fork_rng():

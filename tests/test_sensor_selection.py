@@ -162,16 +162,14 @@ def test_greedy_equals_exhaustive_for_sensors_of_orthogonal_directions(seed, cri
 
 
 @pytest.mark.parametrize("always", [(), (3,)], ids=["alone", "beside others"])
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_greedy_information_is_within_its_bound_of_the_best_set(seed, always):
     H, P, R = problem(seed)
     start = information(H, P, R, [*always])
-    shares = []
     for count in (2, 3, 4):
         greedy = float(select_sensors(H, P, R, count, always=always).information[-1])
         best = information(H, P, R, [*always, *exhaustive("D", H, P, R, count, always)[0]]) - start
-        shares.append(greedy / best)
-    assert all(BOUND <= share <= 1 + 1e-10 for share in shares)
+        assert BOUND <= greedy / best <= 1 + 1e-10
 
 
 def test_greedy_is_not_always_the_best_set():
@@ -184,48 +182,13 @@ def test_greedy_is_not_always_the_best_set():
     assert select_sensors(H, P, R, 2).objective[-1] > value
 
 
-# What the guarantee rests on ------------------------------------------------------------------
-
-
-def gains(H: Tensor, P: Tensor, R: Tensor, criterion: str) -> list[tuple[float, float]]:
-    """Gain of a sensor beside a set and beside that set with one more, for all such triples."""
-
-    def reached(rows: tuple[int, ...]) -> float:
-        return -criterion_value(criterion, posterior(H, P, R, list(rows)))
-
-    found = []
-    for size in range(len(H) - 1):
-        for rows in itertools.combinations(range(len(H)), size):
-            rest = [i for i in range(len(H)) if i not in rows]
-            for extra, sensor in itertools.permutations(rest, 2):
-                small = reached((*rows, sensor)) - reached(rows)
-                large = reached((*rows, extra, sensor)) - reached((*rows, extra))
-                found.append((small, large))
-    return found
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_information_has_diminishing_returns_under_a_diagonal_noise(seed):
-    found = gains(*problem(seed, obs=4, state=3), "D")
-    assert all(0 <= large <= small + 1e-9 for small, large in found)
-
-
 def test_information_grows_but_not_with_diminishing_returns_under_a_full_noise():
     """Sensor 1 reads nothing but the noise of sensor 0, nearly."""
     H = torch.tensor([[1.0], [0.0]], dtype=DOUBLE)
     P, R = torch.ones(1, 1, dtype=DOUBLE), torch.tensor([[1.0, 0.9], [0.9, 1.0]], dtype=DOUBLE)
-    found = gains(H, P, R, "D")
-    assert all(large >= -1e-12 for _, large in found)
-    assert any(large > small + 0.1 for small, large in found)
     chosen = select_sensors(H, P, R, 2)
     assert chosen.indices.tolist() == [0, 1]
     assert chosen.information.diff(prepend=torch.zeros(1)).diff() > 0
-
-
-def test_the_trace_falls_but_not_with_diminishing_returns():
-    found = [pair for seed in range(6) for pair in gains(*problem(seed, 3, 3), "A")]
-    assert all(large >= -1e-12 for _, large in found)
-    assert any(large > small + 1e-3 for small, large in found)
 
 
 # Invariances ----------------------------------------------------------------------------------
@@ -255,21 +218,15 @@ def test_a_depends_on_the_basis_of_the_state_unless_the_target_moves_along():
 
 @pytest.mark.parametrize("criterion", ["D", "A"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_listing_the_sensors_in_another_order_chooses_the_same_ones(seed, criterion):
+def test_neither_the_order_of_the_sensors_nor_their_units_matter(seed, criterion):
     H, P, R = problem(seed, full=True)
     order = torch.randperm(7, generator=torch.Generator().manual_seed(seed))
+    unit = torch.linspace(0.01, 50, 7, dtype=DOUBLE)
     ours = select_sensors(H, P, R, 5, criterion=criterion, always=[order[0]])
-    theirs = select_sensors(H[order], P, R[order][:, order], 5, criterion=criterion, always=[0])
+    H, R = unit[:, None] * H[order], unit[:, None] * R[order][:, order] * unit
+    theirs = select_sensors(H, P, R, 5, criterion=criterion, always=[0])
     assert torch.equal(ours.indices, order[theirs.indices])
     torch.testing.assert_close(ours.objective, theirs.objective)
-
-
-def test_scaling_a_reading_changes_nothing():
-    H, P, R = problem(4, full=True)
-    scale = torch.linspace(0.01, 50, 7, dtype=DOUBLE)
-    theirs = select_sensors(scale[:, None] * H, P, scale[:, None] * R * scale, 6)
-    ours = select_sensors(H, P, R, 6)
-    assert torch.equal(ours.indices, theirs.indices)
     torch.testing.assert_close(ours.information, theirs.information)
 
 

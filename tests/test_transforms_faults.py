@@ -93,32 +93,6 @@ def test_random_delays_are_a_mailbox_in_which_the_newest_letter_counts(in_order)
             assert float(data["observation"][i]) == (0 if newest is None else newest + 1)
 
 
-def test_the_share_of_steps_without_a_reading_is_that_of_empty_mailboxes():
-    late = ObservationDelay(0, max_delay=2, complete_key=COMPLETE)
-    data = staircase(late, batch=4000, horizon=20).rollout(12)[:, 2:]
-    missing = 1 - data["observed"].double().mean((0, 2))
-    law = (1 - 1 / 3) ** 3
-    assert ((missing - law).abs() < 4.5 * math.sqrt(law * (1 - law) / (4000 * OBS))).all()
-    shown = ages(data)[data["observed"]]
-    # 0 steps late, or late and nothing newer at once
-    share = torch.bincount(shown, minlength=3).double() / shown.numel()
-    wanted = torch.tensor([1 / 3, 2 / 9, 4 / 27], dtype=torch.float64) / (1 - law)
-    torch.testing.assert_close(share, wanted, atol=0.01, rtol=0)
-
-
-@pytest.mark.parametrize("in_order", [False, True])
-def test_readings_overtake_each_other_unless_dropped(in_order):
-    late = ObservationDelay(0, max_delay=5, in_order=in_order, groups=[[0, 1, 2, 3, 4]])
-    data = staircase(late, batch=50, horizon=40).rollout(30)
-    seen = data["observed"]
-    assert torch.equal(seen, seen[..., :1].expand_as(seen))  # one packet
-    back = 0
-    for row in range(50):
-        taken = data["observation"][row, seen[row, :, 0], 0]
-        back += int((taken.diff() < 0).sum())
-    assert (back == 0) if in_order else (back > 50)
-
-
 def test_a_reading_that_is_missing_is_never_sent():
     gaps = ObservationMissingness("mcar", 0.4, seed=1, complete_key=COMPLETE)
     sent = collected(gaps)
@@ -270,8 +244,8 @@ def test_a_state_that_got_lost_or_is_another_is_named():
     root["drift_steps"] = torch.zeros(4, OBS)
     with pytest.raises(ValueError, match=r"`drift_steps` must be int64 of shape \(4, 5\)"):
         SensorDrift(1.0)._step(root, step.clone())
-    with pytest.raises(ValueError, match="`state_keys` must be 2 keys of its own"):
-        StuckSensors(0.1, state_keys="state")
+    with pytest.raises(KeyError, match=r"under 'sensor_on', which is not there\. Start from"):
+        SensorOutages(0.5, 5)._step(root, step.clone())
 
 
 @pytest.mark.parametrize(
@@ -302,6 +276,12 @@ def test_a_state_that_got_lost_or_is_another_is_named():
         (lambda: SensorDrift(rate=math.inf), "`rate` must be a number"),
         (lambda: SensorDrift(probability=2.0), "`probability` must be"),
         (lambda: StuckSensors(0.1, groups=[[0], [0, True]]), "`groups` must be lists of indices"),
+        (lambda: StuckSensors(0.1, state_keys="state"), "`state_keys` must be 2 keys of its own"),
+        *[(lambda g=g: SensorOutages(0.5, 5, groups=g), "`groups` must ")
+          for g in ([], [[]], [0, 1], [["a"]], [[True]], "legs")],
+        (lambda: SensorOutages(0.9, 2), "`mean_length` must be at least eta"),
+        (lambda: SensorOutages(0.5, 5, initial="off"), "`initial` must be one of .* got 'off'"),
+        (lambda: SensorOutages(0.5, 5, state_key="observed"), "`state_key` must be a key of its o"),
     ],
 )  # fmt: skip
 def test_what_no_sensor_does_is_refused_in_one_line(make, line):
@@ -318,6 +298,8 @@ def test_what_no_sensor_does_is_refused_in_one_line(make, line):
         (ObservationMultiRate([1, 2]), "`period` must have one entry"),
         (ObservationMultiRate(3, phase=[1, 2]), "`phase` must have one entry"),
         (StuckSensors(0.1, groups=[[5]]), "`groups` must hold indices from -5 to 4"),
+        (SensorOutages(0.5, 5, groups=[[0, 5]]), "`groups` must hold indices from -5 to 4"),
+        (SensorOutages(0.5, 5, groups=[[4], [-1]]), "`groups` must name every component once"),
         (SensorDrift([1.0, 2.0]), "`walk_std` must have one entry per component"),
         (SensorDrift(rate=[1.0, 2.0]), "`rate` must have one entry per component"),
         (SensorDrift(1.0, groups=[[4], [-1]]), "`groups` must name every component once"),

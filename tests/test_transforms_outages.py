@@ -12,10 +12,8 @@ import math
 
 import pytest
 import torch
-from contracts import ACTION, OBS, StaircaseEnv
+from contracts import OBS, StaircaseEnv
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.data import Binary
 from torchrl.envs import Compose, TransformedEnv
 
 from torchrl_drbpn.functional.missingness import outage_rates, sample_working
@@ -51,16 +49,6 @@ def test_masks_follow_the_chain_and_every_episode_has_its_own_start():
             expected = torch.where(over, sample_working(None, rates, like, generator), arrived)
 
 
-@pytest.mark.parametrize("groups", [None, [[0, 1], [2], [3, 4]]], ids=["sensor", "group"])
-def test_the_realised_ratio_is_eta_at_every_step_from_the_first(groups):
-    env = staircase(SensorOutages(0.3, 10, groups=groups), batch=4000, horizon=40)
-    on = env.rollout(20)["sensor_on"]
-    missing = 1 - on.double().mean((0, 2))
-    error = math.sqrt(0.3 * 0.7 / (4000 * on.shape[-1]))
-    assert missing.shape == (20,)
-    assert ((missing - 0.3).abs() < 4 * error).all()
-
-
 def test_from_sensors_that_all_work_the_ratio_rises_to_eta():
     eta, length = 0.5, 8.0
     rates = outage_rates(eta, length)
@@ -75,23 +63,6 @@ def test_from_sensors_that_all_work_the_ratio_rises_to_eta():
 
 
 # ----------------------------------------------------------------------------------- keys and masks
-def test_specs_say_what_is_written():
-    env = staircase(SensorOutages(0.5, 5, groups=GROUPS))
-    spec = env.observation_spec
-    assert isinstance(spec["sensor_on"], Binary)
-    assert spec["sensor_on"].shape == (3, 2)
-    assert env.state_spec["sensor_on"] == spec["sensor_on"]
-
-
-def test_a_mask_that_is_there_is_anded_and_the_chain_goes_on_beneath_it():
-    mask = torch.ones(4, OBS, dtype=torch.bool)
-    mask[:, 2] = False
-    before = data(1.0, observed=mask)
-    before["observation"][:, 2] = math.nan
-    after = SensorOutages(0.3, 5, seed=0)._call(before)
-    assert torch.equal(after["observed"], after["sensor_on"] & mask)
-    assert torch.equal(after["observation"], after["observed"].float())
-    assert after["sensor_on"][:, 2].any()
 
 
 def test_writing_into_the_mask_does_not_repair_a_sensor():
@@ -139,52 +110,4 @@ def test_two_of_them_need_two_states():
     assert (1 - rollout["observed"].double().mean()) == pytest.approx(0.36, abs=0.05)
 
 
-def test_a_state_that_got_lost_is_named_rather_than_drawn_anew():
-    outages = SensorOutages(0.5, 5)
-    root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
-    with pytest.raises(KeyError, match=r"under 'sensor_on', which is not there\. Start from"):
-        outages._step(root, data())
-
-
-@pytest.mark.parametrize(
-    ("groups", "what"),
-    [
-        ([[0, 5]], "`groups` must hold indices from -5 to 4"),
-        ([[0, 1], [1]], "`groups` must name every component once at most"),
-        ([[4], [-1]], "`groups` must name every component once at most"),
-    ],
-)
-def test_groups_of_sensors_that_do_not_exist_or_twice_are_refused(groups, what):
-    with pytest.raises(ValueError, match=what):
-        _ = staircase(SensorOutages(0.5, 5, groups=groups)).observation_spec
-    with pytest.raises(ValueError, match=what):
-        SensorOutages(0.5, 5, groups=groups)._call(data())
-
-
-@pytest.mark.parametrize("groups", [[], [[]], [0, 1], [["a"]], [[True]], "legs"])
-def test_groups_are_lists_of_indices(groups):
-    with pytest.raises(ValueError, match="`groups` must "):
-        SensorOutages(0.5, 5, groups=groups)
-
-
-def test_bad_numbers_and_names_are_refused():
-    with pytest.raises(ValueError, match="`mean_length` must be at least eta"):
-        SensorOutages(0.9, 2)
-    with pytest.raises(ValueError, match=r"`initial` must be one of .* got 'off'"):
-        SensorOutages(0.5, 5, initial="off")
-    with pytest.raises(ValueError, match="`state_key` must be a key of its own"):
-        SensorOutages(0.5, 5, state_key="observed")
-
-
 # ------------------------------------------------------------------------------------- collecting
-def test_a_collector_carries_outages_from_rollout_to_rollout():
-    env = staircase(SensorOutages(0.5, 1e6), batch=3, horizon=100)
-    collector = Collector(
-        env, frames_per_batch=12, total_frames=36, auto_register_policy_transforms=False
-    )
-    masks = [batch["observed"] for batch in collector]
-    collector.shutdown()
-    assert len(masks) == 3
-    # outages of a million steps: what worked at the start works to the end
-    for mask in masks:
-        assert torch.equal(mask, masks[0][:, :1].expand_as(mask))

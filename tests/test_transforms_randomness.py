@@ -9,6 +9,7 @@ in workers too, and leaves the mechanism alone.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
 from functools import partial
@@ -18,7 +19,7 @@ import pytest
 import torch
 from contracts import ACTION, OBS, StaircaseEnv, gym_env, saved
 from tensordict import TensorDict
-from torchrl.envs import Compose, DoubleToFloat, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_drbpn.functional.missingness import missing_probability, sample_mask
 from torchrl_drbpn.transforms import (
@@ -60,20 +61,20 @@ def zero_policy(tensordict):
     return tensordict.set("action", torch.zeros(*tensordict.batch_size, 1))
 
 
-def batched(kind, factory=corrupted_gym, **kwargs):
+WORKERS = ["serial", *(pytest.param(k, marks=pytest.mark.slow) for k in ("fork", "spawn"))]
+
+
+@contextlib.contextmanager
+def batched(kind, **kwargs):
+    """Two corrupted environments, in this process or in two others."""
     if kind == "serial":
-        return SerialEnv(2, factory)
-    return ParallelEnv(2, factory, mp_start_method=kind, **kwargs)
-
-
-workers = pytest.mark.parametrize(
-    "kind",
-    [
-        "serial",
-        pytest.param("fork", marks=pytest.mark.slow),
-        pytest.param("spawn", marks=pytest.mark.slow),
-    ],
-)
+        env = SerialEnv(2, corrupted_gym)
+    else:
+        env = ParallelEnv(2, corrupted_gym, mp_start_method=kind, **kwargs)
+    try:
+        yield env
+    finally:
+        env.close(raise_if_closed=False)
 
 
 def drawn(env, seed=None):
@@ -86,43 +87,25 @@ def drawn(env, seed=None):
     return torch.cat([noise, rollout["observed"], rollout["sensor_on"]], -1)
 
 
-@workers
+@pytest.mark.parametrize("kind", WORKERS)
 def test_without_a_seed_the_global_seeds_make_a_run_and_workers_differ(kind):
-    runs = {}
-    for name in ("first", "again"):
-        env = batched(kind)
-        try:
-            runs[name] = drawn(env, 3)
-            runs[name + " in the same environment"] = drawn(env, 3)
-            runs[name + " with another seed"] = drawn(env, 4)
-        finally:
-            env.close(raise_if_closed=False)
-    first = runs["first"]
-    assert torch.equal(first, runs["again"])
-    assert torch.equal(first, runs["first in the same environment"])
-    assert not torch.equal(first, runs["first with another seed"])
-    assert not torch.equal(first[0], first[1])
-
-
-@workers
-def test_workers_that_nobody_seeded_never_draw_the_same(kind):
     torch.manual_seed(0)  # what forked workers inherit
-    env = batched(kind)
-    try:
-        run = drawn(env)
-    finally:
-        env.close(raise_if_closed=False)
-    assert not torch.equal(run[0], run[1])
+    with batched(kind) as env:
+        unseeded, *runs = drawn(env), drawn(env, 3), drawn(env, 3), drawn(env, 4)
+    with batched(kind) as env:
+        runs.append(drawn(env, 3))
+    assert torch.equal(runs[0], runs[1])
+    assert torch.equal(runs[0], runs[3])
+    assert not torch.equal(runs[0], runs[2])
+    assert not torch.equal(runs[0][0], runs[0][1])
+    assert not torch.equal(unseeded[0], unseeded[1])
 
 
 @pytest.mark.slow
 def test_forked_workers_that_set_seed_does_not_reach_differ_too():
     # without shared buffers TorchRL's workers leave torch's global generator alone
-    env = batched("fork", use_buffers=False)
-    try:
+    with batched("fork", use_buffers=False) as env:
         run = drawn(env, 3)
-    finally:
-        env.close(raise_if_closed=False)
     assert not torch.equal(run[0], run[1])
 
 
@@ -157,20 +140,16 @@ def test_without_a_seed_two_transforms_differ_and_the_global_seed_repeats_them(m
 
 
 # -------------------------------------------------------------------------- seeds, steps and resets
+def lose(x, g):
+    return x.where(torch.rand(x.shape, generator=g) >= 0.3, 0.0)
+
+
 @pytest.mark.parametrize(
     ("make", "stream", "draw"),
     [
         (partial(ObservationNoise, 2.0), 1, lambda x, g: x + 2 * torch.randn(x.shape, generator=g)),
-        (
-            partial(ObservationMissingness, "mcar", 0.3),
-            2,
-            lambda x, g: x.where(torch.rand(x.shape, generator=g) >= 0.3, 0.0),
-        ),
-        (
-            partial(SensorOutages, 0.3, 5),
-            3,
-            lambda x, g: x.where(torch.rand(x.shape, generator=g) >= 0.3, 0.0),
-        ),
+        (partial(ObservationMissingness, "mcar", 0.3), 2, lose),
+        (partial(SensorOutages, 0.3, 5), 3, lose),
     ],
     ids=["noise", "mcar", "outages"],
 )
@@ -188,15 +167,14 @@ def test_classes_with_the_same_seed_are_unrelated():
     kinds = [ObservationNoise, ObservationMissingness, SensorOutages, ObservationSpikes]
     kinds += [ObservationDelay, ObservationMultiRate, StuckSensors, SensorDrift]
     assert len({kind.stream for kind in kinds}) == len(kinds)
-    zeros = TensorDict({"observation": torch.zeros(8000, OBS)}, [8000])
-    drawn = [
-        ObservationNoise(1.0, seed=5)._call(zeros.clone())["observation"].double(),
-        ObservationMissingness("mcar", 0.5, seed=5)._call(zeros.clone())["observed"].double(),
-        SensorOutages(0.5, 2, seed=5)._call(zeros.clone())["observed"].double(),
+    ones = data(batch=(8000,))
+    noise = ObservationNoise(1.0, seed=5)._call(ones.clone())["observation"].double() - 1
+    masks = [
+        make(seed=5)._call(ones.clone())["observed"].double()
+        for make in (partial(ObservationMissingness, "mcar", 0.5), partial(SensorOutages, 0.5, 2))
     ]
-    drawn.append(drawn[0].abs())
-    correlation = torch.corrcoef(torch.stack([part.flatten() for part in drawn])) - torch.eye(4)
-    assert correlation.abs().max() < 4 / math.sqrt(8000 * OBS)
+    drawn = torch.stack([part.flatten() for part in (noise, noise.abs(), *masks)])
+    assert (torch.corrcoef(drawn) - torch.eye(4)).abs().max() < 4 / math.sqrt(8000 * OBS)
 
 
 @pytest.mark.gpu
@@ -257,40 +235,6 @@ def test_the_mechanism_is_that_of_its_own_seed_alone():
     assert not torch.equal(parameters().bias, parameters(mechanism_seed=1).bias)
 
 
-@pytest.mark.parametrize("mechanism", KINDS)
-def test_eta_zero_changes_nothing(mechanism):
-    clean = staircase().rollout(8, break_when_any_done=False)
-    rollout = staircase(ObservationMissingness(mechanism, 0.0)).rollout(
-        8, break_when_any_done=False
-    )
-    assert rollout["next", "observed"].all()
-    assert torch.equal(rollout["next", "observation"], clean["next", "observation"])
-
-
-def test_with_a_seed_the_complete_observation_is_that_of_the_clean_environment():
-    clean = gym_env("Hopper-v5")
-    noisy = TransformedEnv(
-        GymEnv("Hopper-v5"),
-        Compose(
-            DoubleToFloat(),
-            ObservationNoise(0.1, seed=0, complete_key=COMPLETE),
-            ObservationMissingness("nmar", 0.5, seed=0),
-        ),
-    )
-    rollouts = []
-    for env in (clean, noisy):
-        env.set_seed(0)
-        torch.manual_seed(0)
-        rollouts.append(env.rollout(30))
-    assert torch.equal(rollouts[0]["action"], rollouts[1]["action"])
-    for part in ((), ("next",)):
-        expected = rollouts[0][(*part, "observation")]
-        assert torch.equal(rollouts[1][(*part, COMPLETE)], expected)
-        arrived = rollouts[1][(*part, "observed")]
-        assert 0 < arrived.double().mean() < 1
-        assert not torch.equal(rollouts[1][(*part, "observation")][arrived], expected[arrived])
-
-
 # -------------------------------------------------------------------------------------------- state
 def test_a_state_of_another_kind_of_device_starts_again_with_a_warning():
     first = ObservationMissingness("mcar", 0.5, seed=3)
@@ -305,54 +249,32 @@ def test_a_state_of_another_kind_of_device_starts_again_with_a_warning():
 
 
 # ----------------------------------------------------------------------------------------- seed_env
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "single",
-        "serial",
-        "outside",
-        "twice",
-        pytest.param("fork", marks=pytest.mark.slow),
-        pytest.param("spawn", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("kind", ["single", "outside", "twice", *WORKERS])
 def test_seed_env_reproduces_everything_and_gives_every_worker_its_own(kind):
-    if kind == "single":
-        env = corrupted_gym()
-    elif kind == "outside":
-        env = TransformedEnv(SerialEnv(2, corrupted_gym), ObservationNoise(0.5))
-    elif kind == "twice":
-        env = TransformedEnv(corrupted_gym(), ObservationNoise(0.5), auto_unwrap=False)
-    else:
-        env = batched(kind)
-
-    def run(seed):
+    def run(env, seed):
         torch.seed()  # nothing depends on the global generator
         return seed_env(env, seed), drawn(env)
 
-    try:
-        first, again, other = run(3), run(3), run(4)
-    finally:
-        env.close(raise_if_closed=False)
+    with contextlib.ExitStack() as stack:
+        if kind == "single":
+            env = corrupted_gym()
+        elif kind == "twice":
+            env = TransformedEnv(corrupted_gym(), ObservationNoise(0.5), auto_unwrap=False)
+        elif kind == "outside":
+            env = stack.enter_context(batched("serial"))
+            env = TransformedEnv(env, ObservationNoise(0.5))
+        else:
+            env = stack.enter_context(batched(kind))
+        first, again, other = run(env, 3), run(env, 3), run(env, 4)
     assert isinstance(first[0], int)
     assert first[0] == again[0] != other[0]
     assert torch.equal(first[1], again[1])
     assert not torch.equal(first[1], other[1])
     if kind not in ("single", "twice"):
         assert not torch.equal(first[1][0], first[1][1])
-
-
-@pytest.mark.slow
-def test_seed_env_gives_the_same_seeds_in_serial_and_parallel_environments():
-    runs = []
-    for kind in ("serial", "fork"):
-        env = batched(kind)
-        try:
-            seed_env(env, 5)
-            runs.append(drawn(env))
-        finally:
-            env.close(raise_if_closed=False)
-    assert torch.equal(*runs)
+    if kind == "fork":
+        with batched("serial") as env:
+            assert torch.equal(run(env, 3)[1], first[1])
 
 
 @pytest.mark.parametrize(("seed", "error"), [(-1, ValueError), (1.5, TypeError), (True, TypeError)])

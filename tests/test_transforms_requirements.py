@@ -47,15 +47,19 @@ Check = Callable[[TensorDictBase, TensorDictBase], None]
 
 
 # --------------------------------------------------------------------- what each makes of its input
+def complete(before: TensorDictBase, after: TensorDictBase) -> None:
+    """The complete observation is what came."""
+    if COMPLETE in after and "observation" in before:
+        assert torch.equal(after[COMPLETE], before["observation"])
+
+
 def masked(before: TensorDictBase, after: TensorDictBase) -> None:
     """What is missing is 0 and False in the mask, the rest is what came."""
     observation, observed = after["observation"], after["observed"]
     assert observed.dtype == torch.bool
     assert observed.shape == observation.shape
-    if COMPLETE in after:
-        assert torch.equal(observation, after[COMPLETE].where(observed, 0.0))
-        if "observation" in before:
-            assert torch.equal(after[COMPLETE], before["observation"])
+    assert torch.equal(observation, after.get(COMPLETE, observation).where(observed, 0.0))
+    complete(before, after)
 
 
 def reduced(before: TensorDictBase, after: TensorDictBase) -> None:
@@ -75,15 +79,13 @@ def noisy(before: TensorDictBase, after: TensorDictBase) -> None:
     assert "observed" not in after
     assert (noise != 0).all()
     assert (noise.abs() < 1).all()
-    if "observation" in before:
-        assert torch.equal(after[COMPLETE], before["observation"])
+    complete(before, after)
 
 
 def spiked(before: TensorDictBase, after: TensorDictBase) -> None:
     assert "observed" not in after
     assert torch.equal(after["observation"] == after[COMPLETE], ~after["spiked"])
-    if "observation" in before:
-        assert torch.equal(after[COMPLETE], before["observation"])
+    complete(before, after)
 
 
 def grouped(before: TensorDictBase, after: TensorDictBase) -> None:
@@ -101,8 +103,7 @@ def delayed(before: TensorDictBase, after: TensorDictBase) -> None:
     assert after["delayed_observation"].shape == (*observation.shape[:-1], 2, observation.shape[-1])
     # what is in no group is never late
     assert torch.equal(observation[..., 2], after[COMPLETE][..., 2])
-    if "observation" in before:
-        assert torch.equal(after[COMPLETE], before["observation"])
+    complete(before, after)
 
 
 def stuck(before: TensorDictBase, after: TensorDictBase) -> None:
@@ -110,8 +111,7 @@ def stuck(before: TensorDictBase, after: TensorDictBase) -> None:
     assert "observed" not in after
     assert torch.equal(after["observation"], after["stuck_observation"])
     assert torch.equal(after["observation"][works], after[COMPLETE][works])
-    if "observation" in before:
-        assert torch.equal(after[COMPLETE], before["observation"])
+    complete(before, after)
 
 
 def drifting(before: TensorDictBase, after: TensorDictBase) -> None:
@@ -119,8 +119,7 @@ def drifting(before: TensorDictBase, after: TensorDictBase) -> None:
     assert torch.equal(after["observation"], after[COMPLETE] + after["drift_bias"])
     assert torch.equal(after["drift_bias"][..., [0, -1]] != 0, after["drift_steps"] > 0)
     assert (after["drift_bias"][..., 1:-1] == 0).all()
-    if "observation" in before:
-        assert torch.equal(after[COMPLETE], before["observation"])
+    complete(before, after)
 
 
 def filled(before: TensorDictBase, after: TensorDictBase) -> None:
@@ -184,76 +183,31 @@ class Case:
 
 
 mcar = partial(ObservationMissingness, "mcar", 0.5, seed=0)
+seeded = partial(partial, seed=0, complete_key=COMPLETE)  # of a class and its arguments
+ENDS = [[0, 1], [-1]]
 CASES = {
     "mcar": Case(partial(mcar, complete_key=COMPLETE), masked, keys=("observation", COMPLETE)),
-    "mar": Case(partial(ObservationMissingness, "mar", 0.7, seed=0, complete_key=COMPLETE), masked),
-    "nmar": Case(
-        partial(ObservationMissingness, "nmar", 0.7, seed=0, complete_key=COMPLETE), masked
-    ),
+    "mar": Case(seeded(ObservationMissingness, "mar", 0.7), masked),
+    "nmar": Case(seeded(ObservationMissingness, "nmar", 0.7), masked),
     "reduction": Case(
         partial(SensorReduction, [0, -1], complete_key=COMPLETE), reduced, offline=True
     ),
     "nan": Case(ObservedFromNaN, from_nan, offline=True, nan=True),
-    "noise": Case(
-        partial(ObservationNoise, 0.1, seed=0, complete_key=COMPLETE),
-        noisy,
-        keys=("observation", COMPLETE),
-    ),
-    "spikes": Case(
-        partial(ObservationSpikes, 0.3, 50.0, seed=0, complete_key=COMPLETE, spiked_key="spiked"),
-        spiked,
-    ),
-    "outages": Case(partial(SensorOutages, 0.5, 5, seed=0, complete_key=COMPLETE), masked),
-    "groups": Case(
-        partial(
-            SensorOutages,
-            0.4,
-            3,
-            groups=[[0, 1], [-1]],
-            initial="on",
-            seed=0,
-            complete_key=COMPLETE,
-        ),
-        grouped,
-    ),
+    "noise": Case(seeded(ObservationNoise, 0.1), noisy, keys=("observation", COMPLETE)),
+    "spikes": Case(seeded(ObservationSpikes, 0.3, 50.0, spiked_key="spiked"), spiked),
+    "outages": Case(seeded(SensorOutages, 0.5, 5), masked),
+    "groups": Case(seeded(SensorOutages, 0.4, 3, groups=ENDS, initial="on"), grouped),
     "delay": Case(
-        partial(
-            ObservationDelay,
-            0,
-            max_delay=2,
-            groups=[[0, 1], [-1]],
-            seed=0,
-            complete_key=COMPLETE,
-        ),
+        seeded(ObservationDelay, 0, max_delay=2, groups=ENDS),
         delayed,
         keys=("observation", "delayed_observation"),
     ),
     "multi_rate": Case(
-        partial(
-            ObservationMultiRate,
-            [1, 2, 3],
-            phase="random",
-            groups=[[0, 1], [2], [-1]],
-            seed=0,
-            complete_key=COMPLETE,
-        ),
-        masked,
+        seeded(ObservationMultiRate, [1, 2, 3], phase="random", groups=[[0, 1], [2], [-1]]), masked
     ),
-    "stuck": Case(
-        partial(StuckSensors, 0.5, 3, seed=0, complete_key=COMPLETE),
-        stuck,
-        keys=("observation", "stuck_observation"),
-    ),
+    "stuck": Case(seeded(StuckSensors, 0.5, 3), stuck, keys=("observation", "stuck_observation")),
     "drift": Case(
-        partial(
-            SensorDrift,
-            0.1,
-            0.5,
-            probability=0.5,
-            groups=[[0], [-1]],
-            seed=0,
-            complete_key=COMPLETE,
-        ),
+        seeded(SensorDrift, 0.1, 0.5, probability=0.5, groups=[[0], [-1]]),
         drifting,
         keys=("observation", "drift_bias"),
     ),
@@ -261,11 +215,8 @@ CASES = {
     "previous_action": Case(PreviousAction, previous, keys=("previous_action",)),
 }
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-of_observations = pytest.mark.parametrize(
-    "case",
-    [case for case in CASES.values() if "previous_action" not in case.keys],
-    ids=[name for name in CASES if name != "previous_action"],
-)
+OBSERVING = {name: case for name, case in CASES.items() if name != "previous_action"}
+of_observations = pytest.mark.parametrize("case", OBSERVING.values(), ids=OBSERVING)
 
 
 def same(first: TensorDictBase, second: TensorDictBase) -> None:
@@ -454,6 +405,21 @@ def test_with_a_seed_the_global_generator_is_neither_read_nor_advanced(case: Cas
     same(*results)
 
 
+@of_observations
+def test_a_mask_that_is_there_is_anded(case: Case) -> None:
+    data, root = case.data((4,)), case.root((4,))
+    hidden = torch.zeros(4, OBS, dtype=torch.bool)
+    hidden[:, 2] = True
+    expected = case.make()._step(root, data.clone())
+    seen = expected.get("observed", ~hidden)
+    data["observed"] = data.get("observed", ~hidden) & ~hidden
+    data["observation"] = data["observation"].where(~hidden, 0.0)
+    after = case.make()._step(root, data)
+    assert torch.equal(after["observed"], seen & ~hidden)
+    keep = after["observed"]
+    assert torch.equal(after["observation"][keep], expected["observation"][keep])
+
+
 # ----------------------------------------------------------------------- what is not an observation
 @of_observations
 def test_an_absent_observation_is_named(case: Case) -> None:
@@ -466,21 +432,22 @@ def test_an_absent_observation_is_named(case: Case) -> None:
 
 
 @of_observations
-@pytest.mark.parametrize("change", [lambda x: x.long(), lambda x: x > 0], ids=["integer", "bool"])
-def test_an_observation_that_is_not_floating_point_is_refused(case: Case, change: Any) -> None:
-    data = case.data((3,))
-    data["observation"] = change(data["observation"])
-    with pytest.raises(ValueError, match="`observation` must be a vector of floating"):
-        case.make()._step(case.root((3,)), data)
-
-
-@of_observations
 @pytest.mark.parametrize(
-    "mask", [torch.ones(4, 1, dtype=torch.bool), torch.ones(4, OBS)], ids=["shape", "dtype"]
-)
-def test_a_mask_of_wrong_shape_or_dtype_is_refused(case: Case, mask: torch.Tensor) -> None:
-    data = case.data((4,)).set("observed", mask)
-    with pytest.raises(ValueError, match=r"`observed` must be bool of shape .* = \(4, 5\)"):
+    ("key", "change", "message"),
+    [
+        ("observation", torch.Tensor.long, "`observation` must be a vector of floating"),
+        ("observation", torch.Tensor.bool, "`observation` must be a vector of floating"),
+        ("observed", lambda x: x[..., :1] > 0, r"`observed` must be bool of shape .* = \(4, 5\)"),
+        ("observed", torch.ones_like, r"`observed` must be bool of shape .* = \(4, 5\)"),
+    ],
+    ids=["integer", "bool", "mask of another shape", "mask of numbers"],
+)  # fmt: skip
+def test_entries_of_wrong_dtype_or_shape_are_refused(
+    case: Case, key: str, change: Any, message: str
+) -> None:
+    data = case.data((4,))
+    data[key] = change(data["observation"])
+    with pytest.raises(ValueError, match=message):
         case.make()._step(case.root((4,)), data)
 
 
