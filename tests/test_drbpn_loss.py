@@ -88,7 +88,7 @@ class TestContractWithoutAModel(LossContract):
     """A GRU in the filter's place."""
 
     # TorchRL's GRU does not compile.
-    test_compiled_without_a_break_values_and_gradients_are_the_same = None
+    test_compiled_without_a_break_it_is_the_same = None
 
     def make_loss(self, **kwargs):
         return make_gru_loss()[1]
@@ -137,6 +137,15 @@ def test_what_the_collector_wrote_of_the_belief_is_not_read():
     stale["next", "recurrent", "mean"].fill_(torch.nan)
     out = loss(stale)
     assert_identical(out, expected)
+
+
+@pytest.mark.slow
+def test_compiled_ahead_of_time_the_gradients_are_the_same():
+    agent, data = make_belief_agent(), make_data()
+    loss = make_loss(agent)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    grads = [gradients(agent, summed(out)) for out in (loss(data), compiled(data))]
+    torch.testing.assert_close(*grads, rtol=1e-9, atol=1e-12)
 
 
 # ------------------------------------------------------------------------- PPO as if it stood alone
