@@ -104,6 +104,7 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path: Path) -> None:
         ("evaluation.modes=[best]", "`modes` must hold sampled and mean, got 'best'"),
         ("missingness.always_observed=1.0", "`missingness.always_observed` must be under 1"),
         ("env=gym", "`env.id` must be given"),
+        ("env.name=CartPole-v1", "`env.name` is no setting: did you mean"),
     ],
 )
 def test_what_can_not_be_composed_is_one_line(word: str, line: str) -> None:

@@ -10,7 +10,9 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
@@ -249,6 +251,16 @@ def test_a_second_run_into_a_folder_is_refused_and_the_first_one_stays(smoke: Pa
     assert contents(smoke) == before
 
 
+def test_the_command_that_a_refusal_prints_goes_on_with_that_folder(
+    smoke: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(smoke, tmp_path / "eta=0.5, [s 0]")
+    with pytest.raises(UserError) as error:
+        run(folder, *SMOKE)
+    (word,) = shlex.split(str(error.value).removesuffix(".").split("or ")[-1])
+    assert make_config(word).resume == str(folder)
+
+
 def test_a_folder_of_a_run_without_a_checkpoint_is_refused_without_a_promise(
     smoke: Path, tmp_path: Path
 ) -> None:
@@ -272,6 +284,33 @@ def test_a_file_where_a_folder_should_be_is_named(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("hello")
     with pytest.raises(UserError, match="can't be a run folder: "):
         run(tmp_path / "run" / "below", *SMOKE)
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("metrics.csv", "metrics.csv` can't be read as a table: is it damaged"),
+        ("checkpoints", "copy` holds no checkpoint"),
+        ("last checkpoint", "512.pt` must be a checkpoint"),
+        ("config.yaml", "config.yaml"),
+    ],
+)
+def test_a_file_for_a_folder_and_a_folder_for_a_file_are_one_line(
+    smoke: Path, tmp_path: Path, name: str, line: str
+) -> None:
+    folder = copied(smoke, tmp_path)
+    path = last_checkpoint(folder) if name == "last checkpoint" else folder / name
+    if path.is_dir():
+        shutil.rmtree(path)
+        path.write_text("no folder")
+    else:
+        path.unlink()
+        path.mkdir()
+    before = contents(folder / "checkpoints")
+    with pytest.raises(UserError, match=line) as error:
+        resume(folder, "total_frames=640")
+    assert "\n" not in str(error.value)
+    assert contents(folder / "checkpoints") == before
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"", b"fram\n1\n"], ids=repr)
@@ -404,6 +443,28 @@ def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(
     assert not read_table(folder / "evaluation.csv")
 
 
+def test_a_run_that_diverges_later_names_its_last_good_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import ppo_drbpn
+
+    collect = ppo_drbpn.collect
+
+    def spoilt(training: Any) -> Any:
+        if training.frames == 256:
+            with torch.no_grad():
+                next(training.agent.critic.parameters())[0] = torch.inf
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", spoilt)
+    folder = tmp_path / "run"
+    kept = rf"at 256 steps: .* Its last checkpoint, at 256 steps, is in {re.escape(str(folder))}"
+    with pytest.raises(UserError, match=kept):
+        run(folder, *SMOKE, "checkpoint.every_frames=128")
+    assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
+    assert "final" not in (folder / "evaluation.csv").read_text()
+
+
 @pytest.mark.parametrize(
     ("fault", "line"),
     [
@@ -494,6 +555,7 @@ def test_the_command_runs_from_any_directory(tmp_path: Path) -> None:
         (["missingness.eta=1.5"], "`missingness`: `eta` must be a missing rate in [0, 1], got 1.5"),
         (["resume=nowhere"], "nowhere` must be a run folder with config.yaml"),
         (["hydra.run.dir=/dev/null/below"], "`/dev/null/below` can't be used: Not a directory"),
+        (["hydra.run.dir=/proc/below"], "`/proc/below` can't be used: "),  # not writable
     ],
 )
 def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(

@@ -1,7 +1,15 @@
 """What a run survives: kills, a full disk, flipped bits, planted files. Longer than the suite.
 
 ``python tests/torture.py`` (about 20 minutes on a quiet machine) or ``--quick`` (about one).
-Prints one line a class with its counts and leaves with status 1 where a count is not as it must be.
+Prints one line a class with its counts, in between what has been tried (on stderr), and leaves with
+status 1 where a count is not as it must be. Classes named go alone, in any order and at any time:
+``python tests/torture.py sweep planted`` draws the moments that the whole run draws for these two.
+
+kills         50 runs of every belief and algorithm, killed at random moments and resumed
+sweep         8 kills of a sweep and its cells
+full_disk     20 runs of which no file may grow beyond a random size
+flipped_bits  800 flipped bits of a checkpoint
+planted       14 kinds of foreign or damaged files in a run folder
 
 Every run is a process of its own that is killed by SIGKILL at a random moment, resumed, killed
 again, and let go on to its end. It then equals the run that nobody stopped, to the last bit: its
@@ -118,6 +126,11 @@ def unequal(first: Path, second: Path) -> list[str]:
     return found + differences(*states)
 
 
+def progress(text: str) -> None:
+    """Print how far a class has got."""
+    print(f"  {text}", file=sys.stderr, flush=True)  # noqa: T201
+
+
 # Classes --------------------------------------------------------------------------------------
 
 
@@ -142,6 +155,7 @@ def kills(work: Path, draw: random.Random, count: int) -> list[str]:
         different = unequal(straight, killed)
         left = [str(path) for path in killed.rglob(".*.tmp")]
         wrong += [f"{name}: {line}" for line in different + left]
+        progress(f"kills: {name}: {share}, {len(wrong)} wrong so far")
     told = ", ".join(f"{n} {stage}" for stage, n in sorted(stages.items()))
     say(
         f"kills: {count} in {len(cases)} runs ({told}); runs unlike the one not killed: "
@@ -167,13 +181,14 @@ def sweep(work: Path, draw: random.Random, count: int) -> list[str]:
     if command(straight).wait():
         return [f"the sweep failed: {straight.with_suffix('.log').read_text()[-500:]}"]
     seconds = time.perf_counter() - clock
-    for _ in range(count):
+    for number in range(count):
         job = command(killed)
         try:
             job.wait(draw.uniform(0.2, 1) * seconds)
         except subprocess.TimeoutExpired:
             os.killpg(job.pid, signal.SIGKILL)
             job.wait()
+        progress(f"sweep: kill {number + 1} of {count}")
     status = command(killed).wait()
     cells = sorted(path.name for path in straight.iterdir() if path.is_dir())
     wrong = [] if status == 0 else [f"the sweep ended with status {status}"]
@@ -211,6 +226,7 @@ def full_disk(work: Path, draw: random.Random, count: int) -> list[str]:
         finished(folder, CASES["drbpn"])
         wrong += [f"limit {limit}: {line}" for line in unequal(straight, folder)]
         shutil.rmtree(folder)
+        progress(f"full disk: {number + 1} of {count}, {len(wrong)} wrong so far")
     say(
         f"full disk: {refused} of {count} ended in one line; went on unlike the one that had "
         f"room: {len(wrong) - (count - refused)}"
@@ -308,6 +324,7 @@ def planted(work: Path, draw: random.Random, count: int) -> list[str]:
             good = status == 2 and process.is_one_line() and kept
             refused += good
             wrong += [] if good else [f"{name}: status {status}\n{process.log.read_text()[-800:]}"]
+        progress(f"planted: {name}, {len(wrong)} wrong so far")
     say(
         f"planted files: {refused} of {len(harmful)} refused in one line, "
         f"{ignored} of {len(harmless)} without effect"
@@ -326,7 +343,9 @@ CLASSES = {
 
 def main() -> int:
     """Run every class; return the status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
         "classes", nargs="*", choices=[*CLASSES, []], help="all where none is given"
     )
@@ -340,9 +359,9 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as work:
             draw = random.Random(f"{words.seed} {name}")
             found = torment(Path(work), draw, few if words.quick else many)
-        wrong += [f"{name}: {line}" for line in found]
-    for line in wrong:
-        say(f"WRONG {line}")
+        for line in found:
+            say(f"WRONG {name}: {line}")
+        wrong += found
     return int(bool(wrong))
 
 
