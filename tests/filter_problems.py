@@ -142,7 +142,7 @@ class Problem:
     def library(self, form: str) -> FilterOutput:
         return self.run(form, **self.stored(), return_cov=True)
 
-    def oracle(self) -> tuple[Tensor, Tensor, Tensor]:
+    def oracle(self, transition_cov: Any = None) -> tuple[Tensor, Tensor, Tensor]:
         q, p, r = self.covs()
         weights, biases = self.network()
         out = oracles.filter_sequence(
@@ -154,7 +154,7 @@ class Problem:
             initial_mean=self.leaves["initial_mean"],
             initial_cov=p,
             transition=oracles.mean_network(weights, biases, self.residual, self.activation),
-            transition_cov=q,
+            transition_cov=q if transition_cov is None else transition_cov,
             matrix=self.leaves["matrix"],
             noise=r if self.full_noise else torch.diag(r),
             action_matrix=self.leaves["action_matrix"],

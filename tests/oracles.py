@@ -40,11 +40,7 @@ def predict(
 
 
 def _observed_rows(
-    observation: Tensor,
-    observed: Tensor,
-    matrix: Tensor,
-    noise: Tensor,
-    offset: Tensor | None,
+    observation: Tensor, observed: Tensor, matrix: Tensor, noise: Tensor, offset: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     rows = observed.nonzero().squeeze(-1)
     x = observation[rows]
@@ -164,10 +160,7 @@ def filter_sequence(
 
 
 def mean_network(
-    weights: list[Tensor],
-    biases: list[Tensor],
-    residual: bool,
-    activation: str,
+    weights: list[Tensor], biases: list[Tensor], residual: bool, activation: str
 ) -> Transition:
     """Eq. (8) as a plain function: layers of W z + b with relu or tanh between them."""
 
@@ -229,12 +222,7 @@ def spd(dim: int, generator: torch.Generator, scale: float = 1.0) -> Tensor:
 
 
 def random_system(
-    state: int,
-    obs: int,
-    action: int = 2,
-    *,
-    seed: int = 0,
-    full_noise: bool = False,
+    state: int, obs: int, action: int = 2, *, seed: int = 0, full_noise: bool = False
 ) -> LinearSystem:
     """A random stable system with an initial covariance that has nothing to do with Q."""
     g = torch.Generator().manual_seed(seed)

@@ -23,12 +23,7 @@ from tensordict.nn import (
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.modules import (
-    IndependentNormal,
-    ProbabilisticActor,
-    ValueOperator,
-    set_recurrent_mode,
-)
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator, set_recurrent_mode
 from torchrl.objectives.value import GAE
 
 from torchrl_drbpn import BeliefFilter, GaussianTransition, GymnasiumBatchEnv

@@ -13,12 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from ppo_drbpn import collect, train_rollout
-from recipe_tools import (
-    assembled,
-    make_config,
-    read_table,
-    run,
-)
+from recipe_tools import assembled, make_config, read_table, run
 from training.envs import make_env
 from training.ppo import add_advantages, to_sequences
 

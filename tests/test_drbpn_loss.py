@@ -14,16 +14,7 @@ import oracles
 import pytest
 import torch
 from contracts import LossContract
-from small_agents import (
-    ACTION,
-    OBS,
-    TIME,
-    Agent,
-    add_advantages,
-    collect,
-    make_agent,
-    make_filter,
-)
+from small_agents import ACTION, OBS, TIME, Agent, add_advantages, collect, make_agent, make_filter
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import nn
@@ -175,25 +166,22 @@ def assert_identical(received: TensorDictBase, expected: TensorDictBase) -> None
         assert torch.equal(received[key], value), key
 
 
+@pytest.mark.parametrize("model_coeff", [0.0, 3.0])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("length", [TIME, 6])
-def test_with_model_coeff_0_everything_is_ppo_to_the_last_bit(dtype, length):
+def test_the_model_term_leaves_the_ppo_terms_as_they_were_and_with_coeff_0_all(
+    dtype, length, model_coeff
+):
     agent, data = make_belief_agent(dtype), cut(make_data(dtype), length)
     expected, expected_grads = reference(agent, data)
-    out = make_loss(agent, model_coeff=0.0)(data)
-    assert_identical(out, expected)
-    assert out["loss_model"] == 0
-    assert all(map(torch.equal, gradients(agent, summed(out)), expected_grads))
-    assert any(grad.any() for grad in expected_grads[: len(list(agent.belief.parameters()))])
-
-
-def test_the_model_term_leaves_the_ppo_terms_as_they_were():
-    agent, data = make_belief_agent(), make_data()
-    expected, expected_grads = reference(agent, data)
-    out = make_loss(agent, model_coeff=3.0)(data)
+    out = make_loss(agent, model_coeff=model_coeff)(data)
     assert_identical(out, expected)
     ppo = sum(out[key] for key in PPO_TERMS)
+    if model_coeff == 0:
+        assert out["loss_model"] == 0
+        ppo = summed(out)
     assert all(map(torch.equal, gradients(agent, ppo), expected_grads))
+    assert any(grad.any() for grad in expected_grads[: len(list(agent.belief.parameters()))])
 
 
 def test_the_model_term_comes_out_weighted_and_its_metric_does_not():
@@ -270,13 +258,10 @@ def test_every_received_observation_counts_once_however_the_rollout_is_cut(lengt
     expected, entries = counted(agent, data)
     loss = make_loss(agent, model=BeliefModelLoss(reduction="sum"))
     sequences = cut(data, length)
-    total, per_entry = torch.zeros((), dtype=torch.float64), []
-    for minibatch in sequences.split(sequences.shape[0] // 3):
-        out = loss(minibatch)
-        total = total - out["loss_model"].detach()
-        per_entry.append((out["loss_model"], out["log_likelihood"]))
+    outs = [loss(minibatch).detach() for minibatch in sequences.split(sequences.shape[0] // 3)]
+    total = -sum(out["loss_model"] for out in outs)
     torch.testing.assert_close(total, expected.detach(), rtol=1e-10, atol=1e-10)
-    counts = sum((-value / metric).item() for value, metric in per_entry)
+    counts = sum((-out["loss_model"] / out["log_likelihood"]).item() for out in outs)
     assert counts == pytest.approx(entries, abs=1e-6)
 
 
@@ -308,17 +293,6 @@ def test_the_next_observation_is_predicted_from_the_live_belief_with_its_gradien
         torch.testing.assert_close(received, wanted, rtol=1e-8, atol=1e-8)
 
 
-def test_nothing_observed_at_all_is_a_finite_zero():
-    agent, data = make_belief_agent(), make_data()
-    for key in ("observed", ("next", "observed")):
-        data[key].fill_(False)
-    for normalize in ("entry", "step"):
-        loss = make_loss(agent, model=BeliefModelLoss(normalize=normalize))
-        out = loss(data)
-        assert out["loss_model"] == 0
-        assert all(grad.isfinite().all() for grad in gradients(agent, summed(out)))
-
-
 # --------------------------------------------------------------------------------------------- keys
 def test_renamed_entries_reach_the_held_losses():
     agent, data = make_belief_agent(), make_data()
@@ -344,15 +318,13 @@ def test_renamed_entries_reach_the_held_losses():
 
 
 def test_keys_set_on_a_held_loss_are_the_losss_own():
-    agent, data = make_belief_agent(), make_data()
-    expected = make_loss(agent)(data)
-    loss = make_loss(agent)
+    loss = make_loss()
     loss.ppo_loss.set_keys(advantage="adv", reward="scaled_reward")
     loss.model_loss.set_keys(final="cut")
-    data.rename_key_("advantage", "adv").rename_key_("final", "cut")
     assert (loss.tensor_keys.advantage, loss.tensor_keys.reward) == ("adv", "scaled_reward")
     assert {"adv", "cut"} <= set(loss.in_keys)
-    assert torch.equal(loss(data)["loss_model"], expected["loss_model"])
+    data = make_data().rename_key_("advantage", "adv").rename_key_("final", "cut")
+    assert torch.equal(loss(data)["loss_model"], make_loss()(make_data())["loss_model"])
 
 
 def test_coefficients_are_those_of_the_held_loss():
@@ -474,9 +446,7 @@ def test_bad_use_is_one_clear_line(use, error, message):
 @pytest.mark.parametrize("model_coeff", [0.0, 1.0])
 def test_functional_or_not_gives_the_same_terms_and_gradients(model_coeff):
     agent, data = make_belief_agent(), make_data()
-    outs = [
-        make_loss(agent, ppo={"functional": functional}, model_coeff=model_coeff)(data)
-        for functional in (True, False)
-    ]
+    options = {"model_coeff": model_coeff}
+    outs = [make_loss(agent, ppo={"functional": f}, **options)(data) for f in (True, False)]
     assert_identical(*outs)
     assert all(map(torch.equal, *(gradients(agent, summed(out)) for out in outs)))

@@ -32,15 +32,9 @@ NOISE = 0.01
 
 
 def make_env(last: list[Transform]) -> EnvBase:
-    env = TransformedEnv(
-        GymnasiumBatchEnv("InvertedPendulum-v5", ENVS),
-        Compose(
-            DoubleToFloat(),
-            ObservationNoise(NOISE, complete_key="complete_observation"),
-            ObservationMissingness("mcar", 0.3),
-            *last,
-        ),
-    )
+    noise = ObservationNoise(NOISE, complete_key="complete_observation")
+    chain = Compose(DoubleToFloat(), noise, ObservationMissingness("mcar", 0.3), *last)
+    env = TransformedEnv(GymnasiumBatchEnv("InvertedPendulum-v5", ENVS), chain)
     seed_env(env, 0)
     return env
 

@@ -14,7 +14,6 @@ import torch
 from particle_tools import make_filter as make_particles
 from small_agents import (
     ACTION,
-    ENVS,
     GAMMA,
     LMBDA,
     OBS,
@@ -27,8 +26,6 @@ from small_agents import (
     make_gae,
 )
 from tensordict import TensorDictBase
-from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs.utils import step_mdp
 from torchrl.modules import GRUModule, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
@@ -56,7 +53,6 @@ def particle_filter() -> ParticleFilterModule:
     return ParticleFilterModule(make_particles(OBS, ACTION))
 
 
-BOTH = pytest.mark.parametrize("make_module", [gru, belief_filter])
 EVERY = pytest.mark.parametrize("make_module", [gru, belief_filter, particle_filter])
 
 
@@ -111,48 +107,6 @@ def test_gae_reads_the_values_of_stored_and_next_beliefs(make_module, shifted):
     scale = advantage.abs().max().item()
     torch.testing.assert_close(through["advantage"], advantage, rtol=limit, atol=limit * scale)
     torch.testing.assert_close(through["value_target"], target, rtol=limit, atol=limit * scale)
-
-
-@BOTH
-def test_it_learns_over_minibatches_of_sequences(make_module):
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        agent = make_agent(make_module(), 6, dtype=DTYPE)
-        gae, loss = make_gae(agent), ClipPPOLoss(agent.policy, agent.value)
-        before = [parameter.detach().clone() for parameter in loss.parameters()]
-        optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-        collector = Collector(
-            make_env(DTYPE),
-            agent.policy,
-            frames_per_batch=ENVS * TIME,
-            total_frames=2 * ENVS * TIME,
-            auto_register_policy_transforms=True,
-        )
-        buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(ENVS * TIME // 6),
-            sampler=SamplerWithoutReplacement(),
-            batch_size=4,
-        )
-        try:
-            for data in collector:
-                with set_recurrent_mode(True), torch.no_grad():
-                    gae(data)
-                buffer.empty()
-                buffer.extend(data.reshape(-1).reshape(-1, 6))
-                for minibatch in buffer:
-                    assert minibatch.shape == (4, 6)
-                    out = loss(minibatch)
-                    total = out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]
-                    optimizer.zero_grad()
-                    total.backward()
-                    optimizer.step()
-                    assert total.isfinite()
-        finally:
-            collector.shutdown()
-    for parameter, old in zip(loss.parameters(), before, strict=True):
-        assert parameter.isfinite().all()
-        assert parameter.grad is not None
-        assert not torch.equal(parameter, old)
 
 
 def test_without_its_primer_the_filter_says_so_where_a_gru_is_silent():

@@ -79,18 +79,11 @@ def test_the_first_epoch_is_that_of_the_plain_update_and_later_ones_differ():
     assert losses(True, 2) != losses(False, 2)
 
 
-def test_a_belief_without_memory_learns_from_single_steps():
-    lengths = {}
-    for belief in ("none", "gru", "drbpn"):
+def test_a_belief_without_memory_learns_from_single_steps_and_the_last_of_a_rollout_is_final():
+    for belief, length in (("none", 1), ("gru", 8), ("drbpn", 8)):
         training, data = collected(f"belief={belief}", "optim.sequence_length=8")
-        lengths[belief] = next(training.algorithm.cut(data)).shape[1]
-    assert lengths == {"none": 1, "gru": 8, "drbpn": 8}
-
-
-def test_the_last_step_of_every_environment_is_final_and_no_other():
-    training, data = collected("optim.sequence_length=8")
-    envs, time = data.shape
-    assert time > 8  # cuts inside the rollout are among the others
-    final = next(training.algorithm.cut(data))["final"].reshape(envs, time)
-    assert final[:, -1].all()
-    assert not final[:, :-1].any()
+        batch = next(training.algorithm.cut(data))
+        assert batch.shape[1] == length
+        final = batch["final"].reshape(data.shape)
+        assert final[:, -1].all()
+        assert not final[:, :-1].any()
