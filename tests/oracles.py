@@ -22,9 +22,6 @@ from torch import Tensor
 Transition = Callable[[Tensor, Tensor], Tensor]
 
 
-# --- one step, one vector -----------------------------------------------------------------------
-
-
 def predict(
     mean: Tensor,
     cov: Tensor,
@@ -84,9 +81,6 @@ def log_likelihood(
     s = h @ cov @ h.T + r
     mahalanobis = residual @ torch.linalg.solve(s, residual)
     return -0.5 * (mahalanobis + torch.logdet(s) + x.numel() * math.log(2 * math.pi))
-
-
-# --- a batch of sequences -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -173,9 +167,6 @@ def mean_network(
         return mean + z if residual else z
 
     return transition
-
-
-# --- scenarios: linear systems, some with answers known in closed form --------------------------
 
 
 @dataclass(frozen=True)

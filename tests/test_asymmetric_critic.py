@@ -1,9 +1,4 @@
-"""heads.critic_input=complete: the value reads the complete observation, the policy never does.
-
-What the critic is shown is what complete, noiseless sensors would
-have shown, at the root and at the next step; advantages come from it; nothing that acts reads it;
-and the trained agent acts where it is not written.
-"""
+"""heads.critic_input=complete: the value reads the complete observation, the policy never does."""
 
 from __future__ import annotations
 
@@ -50,7 +45,6 @@ def with_advantages(belief: str):
     return training, data
 
 
-# ------------------------------------------------------------------------------ what it is shown
 @pytest.mark.parametrize("corruption", CORRUPTION.values(), ids=CORRUPTION)
 def test_the_complete_observation_is_what_complete_noiseless_sensors_show(corruption):
     env = make_env(make_config(*SMOKE, *corruption), num_envs=64, seed=3)
@@ -90,7 +84,6 @@ def test_by_default_nothing_complete_is_written():
     assert training.agent.critic.in_keys == ["features"]
 
 
-# ------------------------------------------------------------------------------ who reads it
 @pytest.mark.parametrize("belief", KINDS)
 def test_the_critic_reads_it_and_the_policy_does_not(belief):
     training, data = rollout(belief)
@@ -148,7 +141,6 @@ def test_every_belief_trains_with_it(belief):
     assert all((new != old).any() for new, old in zip(after, before, strict=True))
 
 
-# ------------------------------------------------------------------------------ files
 def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path: Path):
     from evaluation.trained import load_trained_agent
 

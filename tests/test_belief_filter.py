@@ -1,9 +1,4 @@
-"""What `BeliefFilter` is held to: the textbook by hand, any transition, and clear refusals.
-
-`step` and `forward` take tensors. They equal a hand loop of predict and update whatever the kind of
-Q, of R, of transition and of form; the initial belief enters where `reset` says so; a missing entry
-is a deleted row; covariances come only where asked for.
-"""
+"""What `BeliefFilter` is held to: the textbook by hand, any transition, and clear refusals."""
 
 from __future__ import annotations
 
@@ -131,7 +126,6 @@ def make_kind(kind: str, state: int, noise: str = "diag") -> BeliefFilter:
     return model
 
 
-# ------------------------------------------------------------------------------------ the textbook
 @pytest.mark.parametrize("noise", ["diag", "full"])
 @pytest.mark.parametrize("state", [3, 5, 7])
 @pytest.mark.parametrize("kind", KINDS)
@@ -198,7 +192,6 @@ def test_any_transition_works_through_the_module(kind):
     torch.testing.assert_close(out["features"], expected.mean, rtol=1e-9, atol=1e-10)
 
 
-# ------------------------------------------------------------------------------------- construction
 @pytest.mark.parametrize(("obs", "state"), [(4, 4), (17, 17), (105, 32)])
 def test_the_state_has_as_many_components_as_the_observation_up_to_32(obs, state):
     model = BeliefFilter(obs, ACTION)
@@ -237,7 +230,6 @@ def test_it_survives_a_file_a_copy_and_a_cast():
     torch.testing.assert_close(cast(*floats).mean, expected.float(), rtol=1e-3, atol=1e-4)
 
 
-# ---------------------------------------------------------------------------------------- bad input
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

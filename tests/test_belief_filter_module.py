@@ -34,7 +34,6 @@ def with_state(frames: TensorDict, state: int) -> TensorDict:
     return frames.clone().set("recurrent", TensorDict({"mean": mean, "age": age}, shape))
 
 
-# ------------------------------------------------------------------------------------- requirements
 class TestContract(BeliefModuleContract):
     all_outputs = ("features", ("belief", "log_likelihood"), *OPTIONAL)
 
@@ -65,7 +64,6 @@ class TestContractOfANetworkCovariance(TestContract):
         return BeliefFilterModule(belief, **kwargs)
 
 
-# ---------------------------------------------------------------------------------- keys of its own
 def test_the_keys_are_those_of_the_contract_and_a_list_renames_them_by_position():
     module = BeliefFilterModule(make_filter())
     four = ["observation", "observed", "previous_action", "is_init"]
@@ -188,7 +186,6 @@ def test_mean_cov_features_are_the_mean_and_the_lower_triangle():
     assert torch.equal(out["features"], expected)
 
 
-# ------------------------------------------------------------------------------- laws of the filter
 @pytest.mark.parametrize("age", [0, 3])
 def test_the_initial_belief_is_learned_from_episode_starts_and_not_in_mid_episode(age):
     for key in ("features", ("belief", "log_likelihood")):
@@ -202,7 +199,6 @@ def test_the_initial_belief_is_learned_from_episode_starts_and_not_in_mid_episod
             assert learned == (age == 0)
 
 
-# --------------------------------------------------------------------------------------- precision
 def test_autocast_leaves_the_filter_in_its_own_dtype():
     """Half precision would lose the filter's digits; what PyTorch casts are the other networks."""
     written = ["features", ("belief", "log_likelihood"), ("belief", "observation")]

@@ -1,9 +1,4 @@
-"""What `BeliefModelLoss` is held to: a loss's duties, and minus the log-likelihood, each once.
-
-Eq. (12) [DRBPN]: the sum over observed entries, divided by entries (or by steps). The next
-observation counts where no root step holds it: at the end of an episode, and where `final` says
-that the rollout was cut.
-"""
+"""What `BeliefModelLoss` is held to: a loss's duties, and minus the log-likelihood, each once."""
 
 from __future__ import annotations
 
@@ -157,9 +152,6 @@ def test_an_end_that_a_sampler_of_single_steps_wrote_is_not_believed():
     done, final = data["next", "done"].squeeze(-1), data["final"].squeeze(-1)
     assert torch.equal(loss.last_steps(by_rows), done | final)
     assert torch.equal(loss.last_steps(by_steps), data["next", "terminated"].squeeze(-1) | final)
-
-
-# ---------------------------------------------------------------------------------------- bad input
 
 
 @pytest.mark.parametrize(

@@ -78,9 +78,6 @@ def exact() -> Filtered:
     return Filtered()
 
 
-# NIS and NEES of the exact filter ----------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", range(1, OBS + 1))
 def test_the_nis_of_the_exact_filter_is_chi_square_with_as_many_degrees_as_arrived(
     exact: Filtered, count: int
@@ -143,9 +140,6 @@ def test_a_constant_covariance_is_too_small_in_outages_though_its_average_nis_is
     assert found["mistaken"]["nis"] < 0.85
 
 
-# Masks -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_masking_an_entry_equals_deleting_its_row(seed: int) -> None:
     g = torch.Generator().manual_seed(seed)
@@ -170,9 +164,6 @@ def test_nothing_observed_is_zero_per_step_nan_as_an_average_and_changes_no_test
     with_empty, without = consistency(squared, dof), consistency(squared[::2], dof[::2])
     assert all(a == b for a, b in zip(with_empty, without, strict=True))
     assert with_empty.ratio == 7 / 5
-
-
-# Quantiles ---------------------------------------------------------------------------------------
 
 
 def test_chi_square_quantiles_equal_the_closed_forms_and_approach_the_normal_ones():
@@ -209,9 +200,6 @@ def test_a_float32_belief_at_the_noise_floor_has_the_nis_of_float64(
     widened = error.float().double(), S.float().double(), seen
     assert torch.equal(nis(*rounded), nis(*widened))
     assert 0.8 < float(scores[1].sum() / seen.sum()) < 1.2
-
-
-# Bad input ---------------------------------------------------------------------------------------
 
 
 ONES = torch.ones(2, 3)

@@ -1,8 +1,4 @@
-"""Beliefs that leave the range of their numbers, under test: what they stop, and what not.
-
-Such a belief stops its own robot and no other; the belief of an episode that is over goes no
-further; every command answers the filter's error with a line.
-"""
+"""Beliefs that leave the range of their numbers, under test: what they stop, and what not."""
 
 from __future__ import annotations
 

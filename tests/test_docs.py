@@ -1,11 +1,4 @@
-"""What the pages are held to: they name what exists, leave nothing out, and their code runs.
-
-theory.md maps every equation of the paper to functions and tests: each function resolves by
-import, each test exists, and every equation that a docstring cites has a row that names the owner
-of that docstring. api.md lists the public names. Relative links lead somewhere. The guide's code is
-the script beside it, block for block, and the script runs by itself in another folder; so are the
-files of extending.md, which test_extending.py runs.
-"""
+"""What the pages are held to: they name what exists, leave nothing out, and their code runs."""
 
 from __future__ import annotations
 
@@ -39,7 +32,6 @@ EQUATIONS = {2, 3, 8, 10, 11, 12, 13}
 CITATION = re.compile(r"\b[Ee]qs?\.\s+((?:\(?\d+\)?(?:,\s+|\s+and\s+)?)+)\s+\[DRBPN\]")
 
 
-# ----------------------------------------------------------------------------------- reading pages
 def tables(page: Path) -> Iterator[list[list[str]]]:
     """The tables of a page, each as its rows of cells without the rule."""
     rows: list[list[str]] = []
@@ -84,7 +76,6 @@ def names_of_tests(file: str) -> frozenset[str]:
     return frozenset(re.findall(r"^ *def (test_\w+)", text, re.MULTILINE))
 
 
-# ---------------------------------------------------------------------------------------- theory.md
 def test_every_equation_has_a_row_with_code_and_tests():
     rows = equation_rows()
     assert set().union(*(numbers for numbers, _, _ in rows)) >= EQUATIONS
@@ -138,7 +129,6 @@ def test_every_equation_that_a_docstring_cites_has_a_row_that_names_it():
                 assert name in owners[number], f"theory.md, eq. ({number}): `{name}` of {file}"
 
 
-# ------------------------------------------------------------------------------------------- api.md
 @pytest.mark.parametrize("module", ["torchrl_drbpn", "torchrl_drbpn.functional"])
 def test_the_public_names_are_listed_and_no_other(module):
     text = (DOCS / "api.md").read_text(encoding="utf-8")
@@ -171,7 +161,6 @@ def test_notation_names_the_keys_that_are_read_and_written():
         assert f"`{spelt}`" in text, key
 
 
-# -------------------------------------------------------------------------------------------- links
 def slug(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
@@ -190,7 +179,6 @@ def test_every_relative_link_leads_somewhere(page):
             assert anchor in map(slug, headings), f"{page.name}: {target}"
 
 
-# -------------------------------------------------------------------------------------------- guide
 def blocks_of(page: Path, language: str = "python") -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 

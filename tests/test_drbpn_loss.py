@@ -1,10 +1,4 @@
-"""What `DRBPNLoss` is held to: a loss's duties, and eq. (13) [DRBPN] from one filter pass.
-
-PPO's terms are those of TorchRL's ClipPPOLoss on the same beliefs, to the last bit. The model term
-counts every received observation once, x_{T+1} included, however a rollout is cut into sequences.
-Data come from TorchRL's collector: terminations and truncations inside rows, rows that begin in
-mid-episode.
-"""
+"""What `DRBPNLoss` is held to: a loss's duties, and eq. (13) [DRBPN] from one filter pass."""
 
 from __future__ import annotations
 
@@ -65,7 +59,6 @@ def cut(data: TensorDictBase, length: int) -> TensorDictBase:
     return data.reshape(-1).reshape(-1, length)
 
 
-# ------------------------------------------------------------------------------------------- duties
 class TestContract(LossContract):
     def make_loss(self, **kwargs):
         # analytic entropy: nothing is sampled in the loss
@@ -97,7 +90,6 @@ def make_gru_loss(model: BeliefModelLoss | None = None) -> tuple[Agent, DRBPNLos
     return agent, DRBPNLoss(gru, make_ppo(agent), model)
 
 
-# ---------------------------------------------------------------------------------------- one pass
 def test_one_pass_over_time_and_one_step_for_the_last_observations():
     agent = make_belief_agent()
     loss, data, calls = make_loss(agent), make_data(), []
@@ -139,7 +131,6 @@ def test_compiled_ahead_of_time_the_gradients_are_the_same():
     torch.testing.assert_close(*grads, rtol=1e-9, atol=1e-12)
 
 
-# ------------------------------------------------------------------------- PPO as if it stood alone
 def reference(agent: Agent, data: TensorDictBase) -> tuple[TensorDictBase, list]:
     """ClipPPOLoss after a pass of the belief module, and its gradients by all parameters."""
     beliefs = data.copy()
@@ -211,7 +202,6 @@ def test_a_detached_belief_learns_from_the_model_alone():
     assert all(map(torch.equal, *from_model))
 
 
-# -------------------------------------------------------------------- every observation counts once
 def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
     """Log-likelihood of every received observation, and entries, from the row-deleting oracle.
 
@@ -293,7 +283,6 @@ def test_the_next_observation_is_predicted_from_the_live_belief_with_its_gradien
         torch.testing.assert_close(received, wanted, rtol=1e-8, atol=1e-8)
 
 
-# --------------------------------------------------------------------------------------------- keys
 def test_renamed_entries_reach_the_held_losses():
     agent, data = make_belief_agent(), make_data()
     expected = make_loss(agent)(data)
@@ -406,7 +395,6 @@ def test_a_norm_in_front_of_the_filter_scales_the_next_observation_too():
         torch.testing.assert_close(outs[0][key], value, msg=key)
 
 
-# --------------------------------------------------------------------------------------- parameters
 def test_the_parameters_are_those_of_the_modules():
     agent, frame = make_belief_agent(), make_data()[:, 0]
     loss = make_loss(agent)
@@ -438,9 +426,6 @@ def test_the_parameters_are_those_of_the_modules():
 def test_bad_use_is_one_clear_line(use, error, message):
     with pytest.raises(error, match=message):
         use()
-
-
-# ---------------------------------------------------------------------------------------- bad input
 
 
 @pytest.mark.parametrize("model_coeff", [0.0, 1.0])

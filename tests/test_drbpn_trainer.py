@@ -1,9 +1,4 @@
-"""`DRBPNLoss` in TorchRL's own pipelines.
-
-Specified here: it trains inside PPOTrainer, by the trainer's GAE or its own estimator, on slices
-that a replay buffer draws; these count every observation at most once; the estimator that the loss
-builds is exact.
-"""
+"""`DRBPNLoss` in TorchRL's own pipelines."""
 
 from __future__ import annotations
 

@@ -1,11 +1,5 @@
 """Specification of `EnvPoolBatchEnv`: EnvPool's simulators with the manners of GymnasiumBatchEnv.
 
-Parity with Gymnasium: the same specs and limits; from equal states the same observations, rewards
-and ends; resets drawn from the same distribution.
-Manners: only the rows asked for are reset, the last observation of an episode is the true one,
-termination and truncation are told apart on the last step of the limit too; no next episode starts
-unasked; the state can not be saved, and that is said.
-
 EnvPool 1.2.5 carries MuJoCo 3.6. With Gymnasium on MuJoCo 3.6 too, every task agrees to 1e-10 over
 20 steps; on MuJoCo 4.0 the bodies with a free joint (Ant, Humanoid) differ by about 1e-6 at once,
 and a contact that begins a step earlier multiplies that by a thousand. For them every single step
@@ -40,9 +34,6 @@ OTHERS = [task for task in TASKS if task not in FREE_JOINT]
 def _own_directory(tmp_path, monkeypatch):
     # MuJoCo writes the warnings of a model file into the current directory.
     monkeypatch.chdir(tmp_path)
-
-
-# Parity with Gymnasium -------------------------------------------------------------------------
 
 
 def positions_and_velocities(env_id, observation, nq, nv):
@@ -162,9 +153,6 @@ def test_first_observations_have_gymnasiums_distribution(env_id):
     assert ((seen.var(0) - expected.var(0)).abs() <= 5 * spread + 1e-9).all()
 
 
-# Ends and resets -------------------------------------------------------------------------------
-
-
 def test_an_episode_that_terminates_on_the_last_step_of_the_limit_does_both():
     push, length = torch.full((60, 1, 1), 3.0), 60
     for _ in range(2):  # the second time with the limit on the step of the termination
@@ -228,9 +216,6 @@ def test_a_seed_is_used_once_and_asks_for_a_reset_of_every_row():
         with pytest.raises(RuntimeError, match="row 1 was stepped before its first reset"):
             env.step(root)
     torch.testing.assert_close(env.reset(seed=0)["observation"], first, rtol=0, atol=0)
-
-
-# Saving ----------------------------------------------------------------------------------------
 
 
 def test_the_state_can_not_be_saved_and_that_is_said():

@@ -1,10 +1,4 @@
-"""Specification of the batches of simulators: what holds over Gymnasium and over EnvPool.
-
-TorchRL's specs hold; only the rows asked for are reset; the last observation of an episode is the
-true one; a seed decides everything and threads nothing; bad input and faulty simulators are
-answered with one clear line. What one backend alone promises: test_gymnasium_batch.py,
-test_envpool.py.
-"""
+"""Specification of the batches of simulators: what holds over Gymnasium and over EnvPool."""
 
 from __future__ import annotations
 
@@ -26,9 +20,6 @@ pytestmark = [
 def _own_directory(tmp_path, monkeypatch):
     # MuJoCo writes the warnings of a model file into the current directory.
     monkeypatch.chdir(tmp_path)
-
-
-# Specs -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", TASKS)
@@ -57,9 +48,6 @@ def test_actions_outside_the_box_are_clipped_to_it_whatever_their_dtype(backend)
     wild, _ = play(env, env.reset(), [torch.full((2, 3), 7.0, dtype=torch.float64)])
     at_bound, _ = play(env, env.reset(seed=0), [torch.full((2, 3), 1.0)])
     torch.testing.assert_close(wild, at_bound, rtol=0, atol=0)
-
-
-# Seeds -----------------------------------------------------------------------------------------
 
 
 def test_a_seed_decides_each_row_and_without_one_no_two_are_alike(backend):
@@ -101,9 +89,6 @@ def test_threads_change_nothing(backend, threads):
         play(one, one.reset(), actions)[0], play(many, many.reset(), actions)[0], rtol=0, atol=0
     )
     many.close()
-
-
-# Episodes --------------------------------------------------------------------------------------
 
 
 def test_a_partial_reset_touches_only_the_rows_asked_for_which_get_the_whole_time_limit(backend):
@@ -175,9 +160,6 @@ def test_it_works_as_a_worker_of_a_serial_environment(backend):
     env = SerialEnv(2, lambda: backend("InvertedPendulum-v5", 3))
     check_env_specs(env)
     env.close()
-
-
-# Errors ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", ["Walker2D-v5", "Waker2d-v5", "Walker2d-v9"])

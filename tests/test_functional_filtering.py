@@ -1,18 +1,4 @@
-"""Whole sequences: both forms of `functional.filtering` against the slow truth.
-
-Specified here, in float64, for the PyTorch form, the native one, and a Q that depends on the state
-(step by step):
-
-- each equals the row-deleting oracle to 1e-10, in values and in the gradient by every input and
-  parameter, for state smaller than, equal to and larger than obs, with resets, stored states,
-  frames that hold nothing, and diagonal or full noise;
-- a sequence equals its steps; a reset inside a sequence equals two sequences; a stored state equals
-  a sequence begun from it; batch shape is immaterial;
-- nothing observed: the means are the bare transition and the log-likelihood 0, exactly;
-- NaN or inf under a False mask, or a NaN belief before a reset, changes nothing and gets a gradient
-  of exactly 0;
-- every gradient can be differentiated again.
-"""
+"""Whole sequences: both forms of `functional.filtering` against the slow truth."""
 
 from __future__ import annotations
 
@@ -26,8 +12,6 @@ from filter_problems import FORMS, SIZES, Problem, assert_equal, assert_same
 from torch import Tensor
 
 from torchrl_drbpn.functional import filter_sequence, filter_step, filtered_cov
-
-# --- against the oracle -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -104,9 +88,6 @@ def test_a_transition_covariance_that_depends_on_the_state_equals_the_oracle():
     assert_same(problem, tuple(out), problem.oracle(transition_cov=scaled))
 
 
-# --- one form against another -------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_a_diagonal_covariance_equals_its_variances(state, obs):
     problem = Problem(state, obs)
@@ -131,9 +112,6 @@ def test_stepping_through_time_equals_the_whole_sequence(state, obs, form):
         mean = rows[-1].mean
     stepped = tuple(torch.stack(part, 1) for part in zip(*rows, strict=True))
     assert_same(problem, stepped, problem.library(form))
-
-
-# --- what a reset, a restart and a batch shape mean -----------------------------------------------
 
 
 @pytest.mark.parametrize("stored", [False, True], ids=["a reset", "a stored state"])
@@ -196,9 +174,6 @@ def test_memory_layout_does_not_matter(form):
     assert_same(problem, problem.library(form), problem.oracle())
 
 
-# --- missing entries ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("state", "obs"), SIZES)
@@ -243,9 +218,6 @@ def test_what_lies_under_a_false_mask_changes_nothing_and_has_zero_gradient(form
     assert torch.equal(unseen, torch.zeros_like(unseen))
 
 
-# --- covariances --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_covariances_are_computed_only_where_asked_for(form):
     problem = Problem(3, 5)
@@ -288,9 +260,6 @@ def test_no_step_at_all_returns_nothing(form):
     mean, *rest = problem.arguments()
     out = problem.run(form, mean, *(x[:, :0] for x in rest), return_cov=True)
     assert [tuple(x.shape) for x in out] == [(3, 0, 3), (3, 0, 3, 3), (3, 0)]
-
-
-# --- autograd manners -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -338,9 +307,6 @@ def test_inputs_are_left_as_they_were(form):
     before = [x.detach().clone() for x in given]
     problem.gradients(problem.library(form))
     assert all(map(torch.equal, given, before))
-
-
-# --- errors -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -137,9 +137,6 @@ def test_a_float32_step_keeps_its_digits_at_the_noise_floor(state, obs, full_noi
     assert float(relative.max()) < 1e-3
 
 
-# --- one step -----------------------------------------------------------------------------------
-
-
 def smallest_eigenvalues(cov: Tensor) -> Tensor:
     assert torch.isfinite(cov).all()
     assert torch.equal(cov, cov.mT)

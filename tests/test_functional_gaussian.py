@@ -1,16 +1,4 @@
-"""Gaussian pieces of `functional.gaussian`: the masked density and the parametrisations.
-
-Specified here, in float64 unless the test is about float32:
-
-- the masked log density is the density of the sub-vector whose missing entries are deleted, it is
-  0 where nothing is observed, and its dtype is that of its inputs;
-- filling a missing entry stops whatever stood there, in values and in gradients;
-- the matrix with masked rows has the determinant and, on the observed block, the inverse of the
-  sub-matrix;
-- standard deviations and covariances never fall under their floor, are finite for extreme
-  parameters, and pass gradients;
-- the lower triangle says all there is to say about a symmetric matrix.
-"""
+"""Gaussian pieces of `functional.gaussian`: the masked density and the parametrisations."""
 
 from __future__ import annotations
 
@@ -49,9 +37,6 @@ def case(mask: list[bool], batch: int = 3) -> tuple[Tensor, Tensor, Tensor]:
     residual = torch.randn(batch, 4, generator=g, dtype=torch.float64)
     cov = torch.stack([oracles.spd(4, g) for _ in range(batch)])
     return residual, cov, torch.tensor(mask).expand(batch, 4)
-
-
-# --- the masked density -------------------------------------------------------------------------
 
 
 @MASKS
@@ -114,9 +99,6 @@ def test_gradients_of_the_density_agree_with_finite_differences(mask):
     assert torch.autograd.gradcheck(density, leaves)
 
 
-# --- masking ------------------------------------------------------------------------------------
-
-
 @MASKS
 def test_the_masked_matrix_has_the_determinant_and_inverse_of_the_sub_matrix(mask):
     _, cov, observed = case(mask, batch=1)
@@ -145,9 +127,6 @@ def test_zero_missing_keeps_what_arrived_and_its_dtype(dtype):
     filled = zero_missing(values, observed)
     assert filled.dtype == dtype
     assert filled.tolist() == [1.0, 0.0, -3.0, 0.0]
-
-
-# --- parametrisations ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)

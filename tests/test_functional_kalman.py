@@ -36,9 +36,6 @@ def vector(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-# --- missing entries ----------------------------------------------------------------------------
-
-
 @seeded
 @sized
 def test_masking_an_entry_equals_deleting_its_row_in_values_and_gradients(state, obs, seed):
@@ -112,9 +109,6 @@ def test_an_unbounded_noise_variance_is_a_missing_entry(state, obs):
     assert (worst[1:] < worst[:-1] / 50).all()  # it falls as 1 / variance
 
 
-# --- likelihood and innovation ------------------------------------------------------------------
-
-
 @seeded
 @sized
 def test_log_likelihood_is_that_of_the_multivariate_normal(state, obs, seed):
@@ -145,9 +139,6 @@ def test_innovation_is_the_residual_with_zeros_and_the_unmasked_covariance(state
     without = outputs(belief, x, observed, h, r)
     for a, b in zip(without, outputs(belief, x, observed, h, r, 0 * x), strict=True):
         assert_equal(a, b)
-
-
-# --- symmetries ---------------------------------------------------------------------------------
 
 
 @seeded
@@ -218,9 +209,6 @@ def test_gradients_agree_with_finite_differences(kind):
     assert torch.autograd.gradcheck(step, [t.clone().requires_grad_() for t in leaves])
 
 
-# --- what an update may do to a covariance ------------------------------------------------------
-
-
 @seeded
 @sized
 def test_an_update_never_raises_the_trace_nor_any_eigenvalue(state, obs, seed):
@@ -233,9 +221,6 @@ def test_an_update_never_raises_the_trace_nor_any_eigenvalue(state, obs, seed):
     less = observed & (torch.rand(observed.shape, generator=g) < 0.5)
     wider = F.update(belief, x, less, *model).cov
     assert torch.linalg.eigvalsh(wider - cov).min() > -1e-12
-
-
-# --- known answers ------------------------------------------------------------------------------
 
 
 def test_two_steps_by_hand():
@@ -355,9 +340,6 @@ def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagate
         assert_equal(filtered.mean, torch.from_numpy(truth.filtered_state[:, t]), 1e-8)
         assert_equal(filtered.cov, torch.from_numpy(truth.filtered_state_cov[:, :, t]), 1e-8)
         assert_equal(ll, torch.tensor(truth.llf_obs[t], dtype=torch.float64), 1e-8)
-
-
-# --- manners ------------------------------------------------------------------------------------
 
 
 def test_inputs_are_left_as_they_were():

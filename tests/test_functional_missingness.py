@@ -44,7 +44,6 @@ def example(batch=(4,), seed=5):
     return x, torch.randn(*batch, ACTION, generator=generator, dtype=torch.float64)
 
 
-# -------------------------------------------------------------------------------- the mechanism
 @pytest.mark.parametrize(
     ("obs", "share", "count"),
     [(17, 0.25, 4), (11, 0.25, 3), (27, 0.25, 7), (4, 0.0, 1), (4, 0.8, 3)],
@@ -75,7 +74,6 @@ def test_weights_are_standard_normal():
         assert abs(part.var() - 1) < 3.5 * math.sqrt(2 / n)
 
 
-# ------------------------------------------------------------------------------ the probabilities
 @pytest.mark.parametrize("kind", ["mar", "nmar"])
 @pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
 def test_probabilities_are_the_formula_entry_by_entry(kind, eta):
@@ -112,7 +110,6 @@ def test_only_nmar_depends_on_entries_that_may_be_missing(kind, depends):
     assert torch.equal(before, after) is not depends
 
 
-# -------------------------------------------------------------------------------------- the masks
 @pytest.mark.parametrize("eta", [0.05, 0.3, 0.9])
 def test_the_realised_ratio_of_mcar_is_eta(eta):
     missing = 1 - sample_mask(eta, torch.zeros(10_000, OBS), seeded(1)).double()
@@ -148,7 +145,6 @@ def test_a_nan_is_not_hidden_by_the_mask_that_it_would_upset():
     assert observed[0].all()
 
 
-# ---------------------------------------------------------------------------------------- noise
 def test_noise_has_mean_zero_and_the_given_standard_deviation():
     std = torch.tensor([0.0, 0.1, 3.0], dtype=torch.float64)
     noise = sample_noise(std, torch.zeros(40_000, 3, dtype=torch.float64), seeded(8))
@@ -158,7 +154,6 @@ def test_noise_has_mean_zero_and_the_given_standard_deviation():
     assert ((noise.std(0) - std).abs() <= 4 * std / math.sqrt(2 * 40_000)).all()
 
 
-# ------------------------------------------------------------------------------- outages that last
 def chain(eta, mean_length, steps, sensors, seed=0):
     """Return which sensors work, shape (steps, sensors), from the stationary start."""
     rates, generator = outage_rates(eta, mean_length), seeded(seed)
@@ -219,7 +214,6 @@ def test_outages_of_mean_length_1_over_1_minus_eta_have_no_memory():
     assert (strict[1:] == ~strict[:-1]).all()  # the shortest possible: on and off in turn
 
 
-# ---------------------------------------------------------------------------------------- spikes
 def test_spikes_hit_with_their_probability_and_have_their_deviation():
     probability = torch.tensor([0.0, 0.05, 1.0])
     std = torch.tensor([3.0, 20.0, 0.5], dtype=torch.float64)

@@ -47,9 +47,6 @@ def row(problem: Problem) -> tuple:
     )  # fmt: skip
 
 
-# --- an operator like any other -----------------------------------------------------------------
-
-
 @built
 @pytest.mark.parametrize("obs", [3, 5], ids=["innovation", "information"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
@@ -87,9 +84,6 @@ def test_fake_tensors_and_traces_meet_an_operator():
     assert any(node.target is below for node in traced.graph.nodes)
 
 
-# --- the rule -----------------------------------------------------------------------------------
-
-
 @built
 def test_what_it_does_not_take_it_names():
     problem = Problem(2, 3)
@@ -121,9 +115,6 @@ def test_what_it_does_not_take_it_names():
     found = []
     torch.func.vmap(lambda x: found.append(reason(model, x)) or x)(torch.zeros(2, 2).double())
     assert found == ["torch.func transforms PyTorch's operations"]
-
-
-# --- wrong arguments ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("place", range(15))
@@ -175,9 +166,6 @@ def test_a_covariance_that_cannot_be_factorised_spoils_its_own_row_alone():
         rows = [0, 1, 3, 4]
         assert torch.equal(out.mean[rows], expected.mean[rows])
         assert torch.equal(out.mean[2, :3], expected.mean[2, :3])
-
-
-# --- a package built without it -----------------------------------------------------------------
 
 
 def test_a_package_built_without_it_filters_in_pytorch_and_says_so_once(monkeypatch):

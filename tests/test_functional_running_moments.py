@@ -1,9 +1,4 @@
-"""The moments of incomplete data are those of the observed values alone.
-
-Specified here: `masked_moments` against torch.var on the values that are left when the missing
-ones are deleted; merging in any order and grouping; no loss of precision where the mean is large;
-nothing observed changes nothing; a wild reading is moved to a bound and the others are not.
-"""
+"""The moments of incomplete data are those of the observed values alone."""
 
 import functools
 
@@ -86,7 +81,6 @@ def test_other_masks_and_sensors_are_refused():
         merge_moments(nothing(2), nothing(3))
 
 
-# ------------------------------------------------------------------------------------ wild readings
 @pytest.mark.parametrize("missing", [0.0, 0.9])
 @pytest.mark.parametrize("learned", [False, True], ids=["first", "later"])
 def test_readings_of_a_normal_sensor_are_left_as_they_are(missing, learned):

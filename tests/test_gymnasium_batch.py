@@ -1,9 +1,4 @@
-"""Specification of what `GymnasiumBatchEnv` alone promises, beside test_envs.py.
-
-Its trajectories are those of `gymnasium.make`, to the last bit, wrappers and time limits included;
-a saved state goes on to the last bit in a fresh object; a simulator that fails is named, and one
-whose physics engine resets itself is counted and ends its episode.
-"""
+"""Specification of what `GymnasiumBatchEnv` alone promises, beside test_envs.py."""
 
 from __future__ import annotations
 
@@ -68,9 +63,6 @@ class Counter(gymnasium.Env):
             raise ZeroDivisionError("a joint has no mass")
         reward = float(self.fails) if self.time == self.at and self.fails in ("nan", "inf") else 1.0
         return np.full(3, self.time, np.float32), reward, False, False, {}
-
-
-# The same trajectories as Gymnasium's ----------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", TASKS)
@@ -174,9 +166,6 @@ def test_making_writes_no_log_file_and_logs_each_model_warning_once(tmp_path, ca
     assert sum("settotalmass" in record.message for record in caplog.records) <= 1
 
 
-# Faults ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize(
     ("fails", "match"),
@@ -216,9 +205,6 @@ def test_an_engine_that_resets_itself_is_counted_and_ends_the_episode_as_truncat
     root = env.step(root.set("action", env.action_spec.zero()))
     assert not root["next", "truncated"].any()
     assert env.engine_resets.tolist() == [0, 1]
-
-
-# Saving ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", TASKS)
@@ -304,9 +290,6 @@ def test_a_task_without_mujoco_says_that_it_can_not_be_saved():
         assert env.rollout(3)["observation"].shape == (2, 3, 3, 3)
     finally:
         env.close(raise_if_closed=False)
-
-
-# Errors ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,4 @@
-"""The house rules of `CONTRIBUTING.md`, held statically.
-
-Specified here: which room imports which, that no underscore name crosses a room, that `__all__`
-is complete and every public name has a docstring, how long a file may be, that the library prints
-nothing, and that version and defaults are not written twice.
-"""
+"""The house rules of `CONTRIBUTING.md`, held statically."""
 
 from __future__ import annotations
 

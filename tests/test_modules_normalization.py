@@ -1,9 +1,4 @@
-"""What `MaskedObservationNorm` is held to: statistics that are the agent's.
-
-Specified here: what is written; that it learns in `update` alone, each reading that arrived once,
-however a rollout is cut; that one wild reading undoes no sensor; that it is saved, compiled,
-exported and sent to collectors as part of a policy; what is refused.
-"""
+"""What `MaskedObservationNorm` is held to: statistics that are the agent's."""
 
 from __future__ import annotations
 
@@ -80,7 +75,6 @@ def assert_same_state(first: MaskedObservationNorm, second: MaskedObservationNor
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
 
 
-# ---------------------------------------------------------------------------------------- learning
 def test_every_reading_that_arrived_is_learned_from_once():
     rollout = make_rollout()
     norm = learned(rollout)
@@ -163,7 +157,6 @@ def test_in_float32_nothing_overflows():
     assert norm(rollout)["normalized_observation"].isfinite().all()
 
 
-# ----------------------------------------------------------------------------------------- scaling
 def test_what_arrived_is_standardised_and_the_rest_is_zero():
     rollout = make_rollout()
     norm, x = learned(rollout), rollout["observation"]
@@ -217,7 +210,6 @@ def test_a_complete_observation_is_scaled_alike_and_not_learned_from():
     assert norm(make_rollout()).get(keys[1], None) is None
 
 
-# -------------------------------------------------------------------------------- part of a policy
 def make_policy(norm: MaskedObservationNorm, width: int = OBS) -> TensorDictSequential:
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -300,7 +292,6 @@ def test_a_collector_in_another_process_is_sent_the_statistics():
     collector.shutdown()
 
 
-# ----------------------------------------------------------------------------------------- refused
 @pytest.mark.parametrize(
     ("kwargs", "match"),
     [

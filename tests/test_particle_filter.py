@@ -18,7 +18,6 @@ from torchrl.modules import set_recurrent_mode
 from torchrl_drbpn import BeliefModelLoss, ParticleFilterModule
 
 
-# ---------------------------------------------------------------------------------------- duties
 class TestContract(BeliefModuleContract):
     all_outputs = ("features", ("belief", "log_likelihood"), *OPTIONAL)
 
@@ -29,7 +28,6 @@ class TestContract(BeliefModuleContract):
         return out["features"].square().mean() - out["belief", "log_likelihood"].mean()
 
 
-# ------------------------------------------------------------------------------- keys of its own
 def test_keys_are_those_of_the_belief_filter_with_particles_for_the_mean():
     module = ParticleFilterModule(make_filter())
     state = [("recurrent", "particles"), ("recurrent", "log_weight"), ("recurrent", "age")]

@@ -1,8 +1,4 @@
-"""The laws of the particle filter's networks and of its noise.
-
-One particle gives the sequential variational bound, many are that bound over a resampled memory;
-what is missing has no influence; every step has a noise of its own that a replay finds again.
-"""
+"""The laws of the particle filter's networks and of its noise."""
 
 from __future__ import annotations
 
@@ -19,7 +15,6 @@ from torchrl_drbpn.functional import ParticleNoise, ParticleOutput, systematic_a
 from torchrl_drbpn.modules import particle_model
 
 
-# -------------------------------------------------------------------------- laws of the networks
 def run(
     filter: ParticleFilter, data: TensorDict, begin: Tensor | None = None
 ) -> tuple[ParticleOutput, ParticleNoise]:
@@ -143,7 +138,6 @@ def test_variances_never_fall_under_their_floor():
         torch.testing.assert_close(gaussian.variance, torch.full_like(gaussian.mean, floor**2))
 
 
-# ------------------------------------------------------------------------------------- the noise
 def noise_of(data: TensorDict, age: int = 0, **kwargs: Any) -> ParticleNoise:
     filter = make_filter(dtype=torch.float64, **kwargs)
     ages = torch.full((*data.shape, 1), age)

@@ -1,9 +1,4 @@
-"""The mathematics of the particle filter.
-
-Systematic resampling keeps the right number of offspring, and no gradient goes through the choice
-of ancestors; on a linear-Gaussian system the mean weight is unbiased for Kalman's likelihood and
-its log converges to it.
-"""
+"""The mathematics of the particle filter."""
 
 from __future__ import annotations
 
@@ -32,7 +27,6 @@ from torchrl_drbpn.functional import (
 )
 
 
-# ----------------------------------------------------------------------------- weights, resampling
 def test_the_log_density_is_that_of_independent_normals_on_the_observed_entries():
     g = torch.Generator().manual_seed(0)
     x, mean = torch.randn(2, 6, 5, generator=g, dtype=torch.float64)
@@ -80,7 +74,6 @@ def test_the_gradient_goes_to_the_ancestors_and_not_through_their_choice():
     assert log_weight.grad is None
 
 
-# ---------------------------------------------------------------- a linear-Gaussian system
 class LinearGaussian:
     """z = A h + B a + N(0, Q), x = c z + N(0, R), all diagonal but A; h is z itself.
 

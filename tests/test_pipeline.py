@@ -1,9 +1,4 @@
-"""Belief modules in a GRU's place: TorchRL's collector, GAE and ClipPPOLoss, one code for all.
-
-Only the constructor and the keys differ. On fresh data, before any update, the importance ratio is
-1 though episodes end inside rows, rows begin in mid-episode and particles are random; and GAE, in
-one pass or two, reads the values of the beliefs that the collector stored.
-"""
+"""Belief modules in a GRU's place: TorchRL's collector, GAE and ClipPPOLoss, one code for all."""
 
 from __future__ import annotations
 

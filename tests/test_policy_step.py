@@ -1,10 +1,4 @@
-"""PolicyStep: one decision on plain tensors.
-
-Specified here: over whole episodes its action and its state are those of the TensorDict policy
-acting with its mean, in every form of the filter, normalised or not; what is no finite number is
-missing and counted; the action fed back is the one that was chosen; it is a frozen copy;
-torch.export takes it, with a batch of any size, and gives the same numbers.
-"""
+"""PolicyStep: one decision on plain tensors."""
 
 from __future__ import annotations
 

@@ -1,10 +1,4 @@
-"""What the epochs of an update are cut from; optim.recompute_advantages.
-
-Of the rollout the last step of every environment alone is final. Recomputed are values and
-advantages by the current parameters, epoch by epoch: with the parameters that collected the rollout
-nothing changes; without memory the result is TorchRL's GAE with the network itself; the first epoch
-is that of the plain update.
-"""
+"""What the epochs of an update are cut from; optim.recompute_advantages."""
 
 from __future__ import annotations
 

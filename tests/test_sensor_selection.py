@@ -1,12 +1,4 @@
-"""Choosing sensors by H, P and R.
-
-Specified: both criteria are those of the covariance that `functional.update` leaves with the chosen
-rows; greedy picks the best next sensor, equals exhaustive search for sensors of orthogonal
-directions, and stays within 1 - 1/e of it for a diagonal R, for which the information is
-submodular; a full R and the trace are not. Nothing depends on the order of the sensors or, for D,
-on the basis of the state. The exhaustive truth is a loop over all subsets with rows deleted and
-shares no code with the package.
-"""
+"""Choosing sensors by H, P and R."""
 
 from __future__ import annotations
 
@@ -24,9 +16,6 @@ from torchrl_drbpn.functional import Belief
 DOUBLE = torch.float64
 BOUND = 1 - 1 / math.e
 EYE = torch.eye(3)
-
-
-# The truth ------------------------------------------------------------------------------------
 
 
 def posterior(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> Tensor:
@@ -80,9 +69,6 @@ def updated(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> Tensor:
 SHAPES = [pytest.param(6, 3, id="obs>state"), pytest.param(4, 6, id="obs<state")]
 
 
-# Values ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("always", [(), (2, 0)], ids=["alone", "beside others"])
 @pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
 @pytest.mark.parametrize("criterion", ["D", "A"])
@@ -124,9 +110,6 @@ def test_the_trace_is_that_of_the_target():
         EYE, torch.tensor([1.0, 9.0, 9.0]).diag(), torch.ones(3), 1, criterion="A", target=EYE[:1]
     )
     assert only_first.indices.tolist() == [0]
-
-
-# Choice ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("always", [(), (4, 1)], ids=["alone", "beside others"])
@@ -191,9 +174,6 @@ def test_information_grows_but_not_with_diminishing_returns_under_a_full_noise()
     assert chosen.information.diff(prepend=torch.zeros(1)).diff() > 0
 
 
-# Invariances ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_d_does_not_depend_on_the_basis_of_the_state(seed, full):
@@ -238,9 +218,6 @@ def test_ties_go_to_the_lowest_index_in_spite_of_rounding():
     for criterion in ("D", "A"):
         chosen = select_sensors(H, torch.eye(5), torch.ones(15), 15, criterion=criterion)
         assert chosen.indices.tolist() == list(range(15))
-
-
-# Shapes, types ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("criterion", ["D", "A"])
@@ -292,9 +269,6 @@ def test_it_is_accurate_at_the_noise_floor():
             information(H, P, R.diag(), chosen.indices.tolist()), rel=1e-9
         )
         assert chosen.objective[-1] == pytest.approx(criterion_value(criterion, cov), rel=1e-5)
-
-
-# Bad input --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

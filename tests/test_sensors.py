@@ -1,8 +1,4 @@
-"""Names of sensors and what fails together by them.
-
-Every component of every MuJoCo task has a name of its own, in the simulator's order. Sensors that
-fail together share a joint or a kind.
-"""
+"""Names of sensors and what fails together by them."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What the learned state-space model is held to: eq. (2), (3), (8) [DRBPN] and their noise.
-
-Every covariance is symmetric positive definite with a floor under its standard deviations, starts
-exactly where it was told to, and may be diagonal or full, a free parameter or a network. The
-emission starts as [I 0]. Wrong sizes and choices are refused by name.
-"""
+"""What the learned state-space model is held to: eq. (2), (3), (8) [DRBPN] and their noise."""
 
 from __future__ import annotations
 
@@ -34,9 +29,6 @@ def scramble(module: torch.nn.Module, scale: float, seed: int = 0) -> None:
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.copy_(scale * torch.randn(parameter.shape, generator=g, dtype=F64))
-
-
-# --------------------------------------------------------------------------------------- transition
 
 
 @pytest.mark.parametrize(("cov", "cov_network"), COVS)
@@ -94,7 +86,6 @@ def test_the_mean_is_the_network_of_mean_and_action(residual, activation, hidden
     torch.testing.assert_close(transition(mean, action).mean, expected, rtol=1e-12, atol=1e-12)
 
 
-# ----------------------------------------------------------------------------------------- emission
 @pytest.mark.parametrize("state", [3, 5, 8])
 def test_the_emission_starts_as_the_first_rows_or_columns_of_the_identity(state):
     emission = LinearGaussianEmission(OBS, state, ACTION, dtype=F64)
@@ -137,7 +128,6 @@ def test_a_fixed_matrix_is_saved_but_not_learned():
     assert torch.equal(emission.matrix, torch.eye(OBS, 7))
 
 
-# --------------------------------------------------------------------------------- parameters, both
 @pytest.mark.parametrize(
     "module",
     [
@@ -164,7 +154,6 @@ def test_reset_parameters_go_back_to_the_start(module):
         assert (parameter - old).abs().max() < 10
 
 
-# ---------------------------------------------------------------------------------------- bad input
 @pytest.mark.parametrize("value", [0, -1, 2.0, True])
 @pytest.mark.parametrize("name", ["state_dim", "action_dim", "obs_dim"])
 def test_a_dimension_that_is_no_positive_int_is_refused(name, value):

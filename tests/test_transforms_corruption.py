@@ -1,8 +1,4 @@
-"""What the corrupting transforms promise beyond `test_transforms_requirements.py`.
-
-Specs say what is written; several observation keys count as one vector; a mask that is there is
-ANDed; sensors and spikes of each row or component; bad input gives one clear line.
-"""
+"""What the corrupting transforms promise beyond `test_transforms_requirements.py`."""
 
 from __future__ import annotations
 
@@ -40,7 +36,6 @@ def data(value=1.0, batch=(4,), **more):
     return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
-# ----------------------------------------------------------------------------------- keys and specs
 def test_specs_say_what_is_written():
     env = staircase(SPIKES(complete_key=COMPLETE, spiked_key="hit"), MISSING())
     bounded = StaircaseEnv().observation_spec["observation"]
@@ -99,7 +94,6 @@ def test_the_spec_of_an_observation_that_is_no_vector_of_floats_is_refused(trans
         transform.transform_observation_spec(spec)
 
 
-# ------------------------------------------------------------------------- masks that exist already
 def existing_mask():
     mask = torch.ones(4, OBS, dtype=torch.bool)
     mask[:, 2] = False
@@ -131,7 +125,6 @@ def test_infinite_values_are_errors_and_not_gaps():
     assert after["observation"].isinf().all()
 
 
-# ---------------------------------------------------------------------------------- SensorReduction
 def test_indices_and_bools_name_the_same_sensors():
     expected = SensorReduction([1, -1])(data())["observed"]
     for same in ([False, True, False, False, True], torch.tensor([1, 4])):
@@ -173,7 +166,6 @@ def test_sensors_that_do_not_exist_are_refused(missing):
         SensorReduction([0.5])
 
 
-# -------------------------------------------------------------------------------------------- order
 def nested(first, second):
     return TransformedEnv(StaircaseEnv(), Compose(Compose(first), Compose(second)))
 
@@ -248,7 +240,6 @@ def test_a_writer_inside_the_workers_is_found_through_the_specs():
     env.close()
 
 
-# ------------------------------------------------------------------------------------------- errors
 @pytest.mark.parametrize("eta", [-0.1, 1.1, math.nan, True, "0.5", None])
 def test_a_missing_rate_lies_in_the_unit_interval(eta):
     with pytest.raises(ValueError, match=r"`eta` must be a missing rate in \[0, 1\]"):

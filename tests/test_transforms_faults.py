@@ -1,10 +1,4 @@
-"""The laws of late, rare, stuck and drifting readings.
-
-A delay of d shows what was there d steps ago, of this episode alone; random delays are a mailbox in
-which the newest letter counts; rates are a remainder of the time since the reset; a stuck sensor
-repeats what it showed; a drift is the sum of its growth. Groups go together, every row by itself,
-whatever resets. What no sensor can do is refused in one line.
-"""
+"""The laws of late, rare, stuck and drifting readings."""
 
 from __future__ import annotations
 
@@ -53,7 +47,6 @@ def ages(data):
     return (data[COMPLETE] - data["observation"]).round().long()
 
 
-# --------------------------------------------------------------------------------------- delays
 @pytest.mark.parametrize("delay", [0, 1, 4])
 def test_a_fixed_delay_shows_what_was_there_then_in_this_episode(delay):
     data = collected(ObservationDelay(delay, complete_key=COMPLETE))
@@ -116,7 +109,6 @@ def test_a_delay_as_long_as_an_episode_is_refused_where_the_length_is_known():
     staircase(ObservationDelay(4, max_delay=9), StepCounter(max_steps=5)).reset()
 
 
-# ---------------------------------------------------------------------------------------- rates
 def test_readings_arrive_where_the_time_since_the_reset_says():
     period, phase = torch.tensor([1, 2, 3, 4, 5]), torch.tensor([0, 1, 0, 3, 2])
     data = collected(ObservationMultiRate(period, phase=phase, complete_key=COMPLETE))
@@ -140,7 +132,6 @@ def test_random_phases_are_uniform_and_last_for_an_episode():
     assert (seen[:, :4, -1].sum(1) == 1).all()
 
 
-# ---------------------------------------------------------------------------------- stuck sensors
 def test_a_stuck_sensor_repeats_what_it_showed_and_still_counts_as_observed():
     stuck = StuckSensors(onset=2, duration=3, groups=GROUPS, complete_key=COMPLETE)
     data = collected(stuck)
@@ -195,7 +186,6 @@ def test_what_is_stuck_is_what_arrived_last():
                 assert torch.equal(step["observation"], last * seen)
 
 
-# ------------------------------------------------------------------------------------------ drift
 def test_a_ramp_grows_by_its_rate_and_ends_with_its_duration():
     rate = torch.tensor([0.5, -1.0, 0.0, 2.0, 0.25])
     data = collected(SensorDrift(rate=rate, onset=1, duration=4, complete_key=COMPLETE))
@@ -222,7 +212,6 @@ def test_a_drift_that_ends_is_calibrated_and_another_starts_at_zero():
     assert ended.any()
 
 
-# ------------------------------------------------------------------------------- together, refused
 def test_faults_come_on_top_of_each_other_and_masks_are_anded():
     data = collected(
         SensorDrift(0.1),

@@ -1,9 +1,4 @@
-"""FillLastObserved: a missing entry takes the last value of its component observed in this episode.
-
-Specified here, against a loop that fills step by step: values in any arrangement of environments
-with partial resets; `fill_value` before the first observed value; the mask and the raw observation
-stay where they are.
-"""
+"""FillLastObserved: a missing entry takes the last value of its component in this episode."""
 
 import pytest
 import torch

@@ -1,9 +1,4 @@
-"""The law, the groups, the keys and the errors of `SensorOutages`.
-
-Masks follow the functional chain step by step, every episode from its own start; groups fail
-together, what is in none never does; the realised ratio is eta from the first step on, or rises to
-it; an existing mask is ANDed; a lost state is named rather than drawn anew.
-"""
+"""The law, the groups, the keys and the errors of `SensorOutages`."""
 
 from __future__ import annotations
 
@@ -30,7 +25,6 @@ def data(value=1.0, batch=(4,), **more):
     return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
-# ------------------------------------------------------------------------------------------ the law
 def test_masks_follow_the_chain_and_every_episode_has_its_own_start():
     transform = SensorOutages(0.5, 3, seed=0)
     env = staircase(transform)
@@ -60,9 +54,6 @@ def test_from_sensors_that_all_work_the_ratio_rises_to_eta():
     error = math.sqrt(0.25 / (4000 * OBS))
     assert ((missing - law).abs() < 4.5 * error).all()
     assert missing[-1] == pytest.approx(eta, abs=0.02)
-
-
-# ----------------------------------------------------------------------------------- keys and masks
 
 
 def test_writing_into_the_mask_does_not_repair_a_sensor():
@@ -108,6 +99,3 @@ def test_two_of_them_need_two_states():
     assert torch.equal(rollout["observed"], rollout["sensor_on"] & rollout["bus_on"])
     # 1 - .8 * .8; a group is one draw for five entries
     assert (1 - rollout["observed"].double().mean()) == pytest.approx(0.36, abs=0.05)
-
-
-# ------------------------------------------------------------------------------------- collecting

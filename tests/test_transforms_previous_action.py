@@ -1,9 +1,4 @@
-"""PreviousAction: `previous_action` is the action chosen one step before, zero after a reset.
-
-Specified here: the shift by one step with partial resets; that it is the action as the agent chose
-it, not as an action transform earlier in the chain or the environment changed it; that discrete
-actions keep dtype and shape, or become one-hot; that nothing private leaks into the data.
-"""
+"""PreviousAction: `previous_action` is the action chosen one step before, zero after a reset."""
 
 import pytest
 import torch

@@ -1,11 +1,4 @@
-"""What the random transforms promise about seeds, steps, resets and states, and `seed_env`.
-
-Without a seed they follow torch's global generator, and no two workers draw the same. One seed
-gives one sequence, at resets as at steps; MAR and NMAR follow the functional law with the action
-that led to the observation, zero at the first step of an episode; the complete observation is that
-of the clean environment; a mechanism is that of its own seed; `seed_env` reaches every generator,
-in workers too, and leaves the mechanism alone.
-"""
+"""What the random transforms promise about seeds, steps, resets and states, and `seed_env`."""
 
 from __future__ import annotations
 
@@ -46,7 +39,6 @@ def data(value=1.0, batch=(4,), **more):
     return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
-# ---------------------------------------------------------------------------------- without a seed
 def corrupted_gym(**kwargs):
     return gym_env().append_transform(
         Compose(
@@ -139,7 +131,6 @@ def test_without_a_seed_two_transforms_differ_and_the_global_seed_repeats_them(m
     assert second.seed is None
 
 
-# -------------------------------------------------------------------------- seeds, steps and resets
 def lose(x, g):
     return x.where(torch.rand(x.shape, generator=g) >= 0.3, 0.0)
 
@@ -235,7 +226,6 @@ def test_the_mechanism_is_that_of_its_own_seed_alone():
     assert not torch.equal(parameters().bias, parameters(mechanism_seed=1).bias)
 
 
-# -------------------------------------------------------------------------------------------- state
 def test_a_state_of_another_kind_of_device_starts_again_with_a_warning():
     first = ObservationMissingness("mcar", 0.5, seed=3)
     expected = first._call(data())["observed"]
@@ -248,7 +238,6 @@ def test_a_state_of_another_kind_of_device_starts_again_with_a_warning():
     assert torch.equal(received, expected)
 
 
-# ----------------------------------------------------------------------------------------- seed_env
 @pytest.mark.parametrize("kind", ["single", "outside", "twice", *WORKERS])
 def test_seed_env_reproduces_everything_and_gives_every_worker_its_own(kind):
     def run(env, seed):

@@ -46,7 +46,6 @@ COMPLETE = "complete_observation"
 Check = Callable[[TensorDictBase, TensorDictBase], None]
 
 
-# --------------------------------------------------------------------- what each makes of its input
 def complete(before: TensorDictBase, after: TensorDictBase) -> None:
     """The complete observation is what came."""
     if COMPLETE in after and "observation" in before:
@@ -236,7 +235,6 @@ def corrupted_simulator(case: Case) -> TransformedEnv:
     return env
 
 
-# ----------------------------------------------------------------------------------- TorchRL's list
 @every
 @pytest.mark.parametrize("batched", [False, True])
 def test_specs_are_met_in_one_environment(case: Case, batched: bool) -> None:
@@ -337,7 +335,6 @@ def test_keys_under_next_are_a_vector_of_their_own(name: str) -> None:
     case.check(data["next"], after["next"])
 
 
-# ----------------------------------------------------------------------------- the rest of the list
 @every
 def test_float64_is_kept(case: Case) -> None:
     after = case.make()._step(case.root((3,), torch.float64), case.data((3,), torch.float64))
@@ -420,7 +417,6 @@ def test_a_mask_that_is_there_is_anded(case: Case) -> None:
     assert torch.equal(after["observation"][keep], expected["observation"][keep])
 
 
-# ----------------------------------------------------------------------- what is not an observation
 @of_observations
 def test_an_absent_observation_is_named(case: Case) -> None:
     transform = case.make()
