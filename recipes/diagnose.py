@@ -9,6 +9,7 @@ them by the steps since a sensor was last seen.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from evaluation.conditions import parse_conditions, removed_sensors
 from evaluation.folders import find_folders, output_folder, with_checkpoint
 from evaluation.trained import load_trained_agent
 from rendering.style import save_figure
-from training.config import check_mode, command
+from training.config import check_limits, check_mode, command
 from training.console import say
 from training.errors import UserError
 from training.run_folder import write_whole
@@ -42,9 +43,7 @@ def run(config: dict[str, Any]) -> int:
         return _draw(Path(config["redraw"]))
     check_mode(config["mode"])
     class_names(config["bins"])
-    for name, least in (("episodes", 1), ("resamples", 2)):
-        if config[name] < least:
-            raise UserError(f"`{name}` must be {least} or more, got {config[name]}.")
+    check_limits(config, {"episodes": (1, inf), "resamples": (2, inf)}, whole=True)
     if not config["points"]:
         raise UserError("`points` must hold at least one, such as trained or mcar:0.5.")
     folders = find_folders(config["run"])

@@ -9,6 +9,7 @@ with its 95 % interval over the nominal and the realised missing ratio.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import pandas as pd
 from analysis.figures import draw_evaluation
 from analysis.runs import EPISODE_TABLES
 from evaluation.conditions import Condition, default_conditions, parse_conditions
+from evaluation.episodes import over_episodes
 from evaluation.folders import find_folders, with_checkpoint
 from evaluation.sensor_choice import kept_sensors
 from evaluation.table import Protocol, Table, evaluate_tasks
 from evaluation.trained import TrainedAgent, load_trained_agent
 from rendering.style import save_figure
-from training.config import check_mode, command
+from training.config import check_limits, check_mode, command
 from training.console import say
 from training.errors import UserError
 from training.sensors import have_names
@@ -62,11 +64,7 @@ def run(config: dict[str, Any]) -> int:
 
 
 def _protocol(config: dict[str, Any]) -> Protocol:
-    for name in ("episodes", "threads", "processes"):
-        value = config[name]
-        unset = value is None and name == "processes"
-        if not unset and (type(value) is not int or value < 1):
-            raise UserError(f"`{name}` must be a whole number of at least 1, got {value!r}.")
+    check_limits(config, dict.fromkeys(("episodes", "threads", "processes"), (1, inf)), whole=True)
     if not config["modes"]:
         raise UserError("`modes` must hold sampled, mean or both, got none.")
     for mode in config["modes"]:
@@ -110,13 +108,12 @@ def _conditions(config: dict[str, Any], folder: Path, trained: TrainedAgent) -> 
     return parse_conditions(listed, trained.settings, spike_std=float(config["spike_std"]))
 
 
-def _summary(rows: Sequence[dict[str, Any]]) -> str:
-    missing = sum(row["missing_ratio"] * row["length"] for row in rows)
-    parts = [f"missing {missing / sum(row['length'] for row in rows):.3f}"]
-    for mode in dict.fromkeys(row["mode"] for row in rows):
-        returns = [row["return"] for row in rows if row["mode"] == mode]
-        parts.append(f"{mode} {sum(returns) / len(returns):.1f}")
-    if stopped := sum(row["diverged"] for row in rows):
+def _summary(rows: pd.DataFrame) -> str:
+    found = over_episodes(rows.infer_objects(), ["point", "mode"])
+    missing = 1 - found.arrived.sum() / found.steps.sum()
+    means = zip(found["mode"], found.return_mean, strict=True)
+    parts = [f"missing {missing:.3f}", *(f"{mode} {mean:.1f}" for mode, mean in means)]
+    if stopped := rows.diverged.sum():
         parts.append(f"belief diverged in {stopped} of {len(rows)} episodes")
     return ", ".join(parts)
 

@@ -20,11 +20,11 @@ from rendering.belief_figure import chosen_sensors, draw_belief
 from rendering.style import save_figure
 from rendering.trajectory import record_episode
 from rendering.video import Film, robot_size, write_video
-from training.config import check_mode, command
+from training.config import check_limits, check_mode, command
 from training.console import say
 from training.errors import UserError
 
-_RANGES = {
+_LIMITS = {
     "start": (0, inf),
     "steps": (1, inf),
     "every": (1, inf),
@@ -93,9 +93,7 @@ def _check(config: dict[str, Any]) -> Path:
     """Refuse what can't be shown, before an agent is loaded; return where it goes."""
     if config["run"] is None or not Path(config["run"]).is_dir():
         raise UserError(f"`run` must name a run folder: run=runs/<folder>, got {config['run']}.")
-    for name, (low, high) in _RANGES.items():
-        if not low <= config[name] <= high:
-            raise UserError(f"`{name}` must be in [{low}, {high}], got {config[name]}.")
+    check_limits(config, _LIMITS)
     check_mode(config["mode"])
     out = Path(config["out"] or Path(config["run"]) / "play.gif")
     if not out.parent.is_dir():

@@ -8,6 +8,7 @@ are drawn together; runs that have not learned these are left out.
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any, Literal
 
 import pandas as pd
@@ -17,7 +18,7 @@ from evaluation.folders import find_folders, output_folder, with_checkpoint
 from evaluation.sensor_choice import SensorModel, learned_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent
 from rendering.style import save_figure
-from training.config import command
+from training.config import check_limits, command
 from training.console import say
 from training.errors import UserError
 from training.run_folder import write_whole
@@ -25,8 +26,7 @@ from training.run_folder import write_whole
 
 def run(config: dict[str, Any]) -> int:
     """Read the runs and draw them; see conf/plot_sensors.yaml."""
-    if config["orders"] < 20 or config["dpi"] < 1:
-        raise UserError("`orders` must be 20 or more, for a band of 5 to 95 %, `dpi` 1 or more.")
+    check_limits(config, {"orders": (20, inf), "dpi": (1, inf)}, whole=True)  # a band of 5 to 95 %
     folders = find_folders(config["run"])
     out, folders = output_folder(config["out"], folders), with_checkpoint(folders)
     torch.set_num_threads(1)  # many small matrices

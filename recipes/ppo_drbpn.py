@@ -20,6 +20,7 @@ from evaluation.folders import override
 from evaluation.while_training import evaluate_training
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from hydra_plugins.cell_sweeper import continued, run_cell
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
@@ -42,7 +43,6 @@ from training.run_folder import (
     write_versions,
 )
 from training.state import Training
-from training.sweep import continued, run_cell
 
 from torchrl_drbpn import BeliefDivergedError
 
@@ -51,9 +51,6 @@ def assemble(config: DictConfig) -> Training:
     """Build everything a run needs, from its seed.
 
     The global generator of torch is seeded here: initial weights and sampled actions come from it.
-
-    Raises:
-        UserError: if a part refuses its settings.
     """
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
@@ -78,17 +75,7 @@ def assemble(config: DictConfig) -> Training:
 
 
 def collect(training: Training) -> TensorDictBase:
-    """Collect one rollout; scale its rewards and normalise the observations that follow its steps.
-
-    Args:
-        training: of which the environment moves on and the statistics of rewards learn.
-
-    Returns:
-        The rollout, batch size ``(environments, time)``.
-
-    Raises:
-        EnvironmentFault: if the environment fails, or gives numbers that are none.
-    """
+    """Collect one rollout; scale its rewards and normalise the observations after its steps."""
     try:
         with warnings.catch_warnings():
             # The simulators warn of an engine that reset itself; the loop counts and says it.
@@ -116,11 +103,7 @@ def collect(training: Training) -> TensorDictBase:
 def train_rollout(
     training: Training, config: DictConfig
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Collect one rollout and learn from it.
-
-    Returns:
-        What there is to log, times left out, and a row for each episode that finished.
-    """
+    """Collect one rollout and learn from it; return its numbers, and a row a finished episode."""
     if training.frames == 0:
         # First statistics, from a rollout that is not trained on.
         training.agent.norm.update(collect(training))
@@ -151,15 +134,8 @@ def train_rollout(
 def train(config: DictConfig, folder: Path) -> int:
     """Train an agent to the end, or until a signal; save it; evaluate it.
 
-    Args:
-        config: of the run; ``resume`` names ``folder`` to go on from its last checkpoint.
-        folder: the run folder.
-
-    Returns:
-        Exit status: 0, or 130 or 143 where Ctrl-C or SIGTERM stopped the run. It was saved then.
-
-    Raises:
-        UserError: if a setting, the folder or a checkpoint can't be used, or training diverges.
+    With ``resume`` the run goes on from its last checkpoint. Returns the exit status: 0, or 130 or
+    143 where Ctrl-C or SIGTERM stopped the run. It was saved then.
     """
     training = assemble(config)
     with locked(folder), StopRequest() as stop:
@@ -292,14 +268,7 @@ def job(config: DictConfig) -> int:
 
 
 def cell(config: DictConfig) -> int:
-    """Run one job of a sweep, from wherever its folder stands.
-
-    Args:
-        config: what Hydra composed.
-
-    Returns:
-        The exit status.
-    """
+    """Run one job of a sweep, from wherever its folder stands."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     wanted = continued(checked(config, command_line()), folder)
     if wanted is None:

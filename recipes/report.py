@@ -9,6 +9,7 @@ every study. ``notes.md`` in that folder, written by hand, is put below the head
 from __future__ import annotations
 
 import glob
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from analysis.runs import Study, read_runs, write_table
 from analysis.tables import derived_tables
 from evaluation.folders import find_folders
 from rendering.style import save_figure
-from training.config import command
+from training.config import check_limits, command
 from training.console import say
 from training.errors import UserError
 from training.run_folder import write_whole
@@ -40,8 +41,7 @@ def run(config: dict[str, Any]) -> int:
     out = config["out"] and Path(config["out"])
     if not out or out.is_file():
         raise UserError(f"`out` must be the folder of a study, such as results/robust, got {out}.")
-    if not isinstance(config["rows"], int) or config["rows"] < 2:
-        raise UserError(f"`rows` must be a whole number of at least 2, got {config['rows']!r}.")
+    check_limits(config, {"rows": (2, inf)}, whole=True)
     study = read_runs(
         find_folders(config["run"]),
         config["table"],

@@ -23,9 +23,10 @@ import torch
 pytest.importorskip("hydra")
 pytest.importorskip("matplotlib")
 from evaluation_tools import parse, read_rows  # isort: skip
+
 import diagnose
 from analysis import calibration as diagnosis
-from analysis.calibration import Compared, Tally, class_names, pool
+from analysis.calibration import Compared, Tally, class_names
 from analysis.calibration_figures import outage_figure
 from analysis.calibration_tables import (
     Resampling,
@@ -33,11 +34,12 @@ from analysis.calibration_tables import (
     precision_rows,
     reliability_rows,
 )
+from analysis.scores import gaussian_crps, gaussian_log_score, gaussian_pit
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.image import imread
 from omegaconf import OmegaConf
-from training.errors import UserError
+from torch import Tensor
 from training.run_folder import load_config, write_config
 
 BINS = [1, 2, 3, 6]
@@ -220,15 +222,6 @@ def test_nis_by_class_are_those_of_the_rows_of_a_class_alone() -> None:
     assert sums["nis"][0].tolist() == pytest.approx([4 / 2, 0, 0, 0, 16 / 2])
     # Together: (2, 4) C^-1 (2, 4)' with C^-1 = [[2, -1], [-1, 2]] / 3.
     assert sums["nis_joint"].item() == pytest.approx((2 * 4 + 2 * 16 - 2 * 8) / 3)
-
-
-def test_pooled_tallies_count_the_entries_of_both(agents: dict[str, TrainedAgent]) -> None:
-    first, second = tally_of(agents["drbpn"]), tally_of(agents["drbpn"], seed=5)
-    both = pool([first, second])
-    assert len(both.lengths) == 6
-    for pair, sums in both.sums.items():
-        parts = [tally.sums[pair]["squared"].sum().item() for tally in (first, second)]
-        assert sums["squared"].sum().item() == pytest.approx(sum(parts))
 
 
 # Intervals -------------------------------------------------------------------------------------
@@ -451,33 +444,52 @@ def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(
     assert left - {"precision.png"} == {"precision.csv"}  # few entries are not drawn
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"run": None}, "`run` must name run folders"),
-        ({"redraw": "nowhere"}, "nowhere has no tables"),
-        ({"points": []}, "`points` must hold at least one"),
-        ({"mode": "best"}, "`modes` must hold"),
-        ({"episodes": 0}, "`episodes` must be 1 or more, got 0"),
-        ({"bins": [1, 3, 3]}, "`bins` must be whole numbers that start at 1 and ascend"),
-        ({"resamples": 1}, "`resamples` must be 2 or more"),
-    ],
-)
-def test_bad_input_is_answered_with_one_line(
-    folders: dict[str, Path], tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
-    config = {"run": str(folders["drbpn"]), "out": tmp_path / "study", **DEFAULTS, **changes}
-    with pytest.raises(UserError, match=message) as caught:
-        diagnose.run(config)
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "study").exists()
+# Scores of Gaussian predictions ------------------------------------------------------------------
 
 
-def test_several_runs_need_a_folder_and_a_file_is_none(
-    folders: dict[str, Path], tmp_path: Path
-) -> None:
-    with pytest.raises(UserError, match="`out` must name a folder for 2 runs"):
-        run([str(folders["gru"]), str(folders["none"])], None)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="`out` must be a folder"):
-        run(str(folders["gru"]), tmp_path / "file")
+def randn(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_the_probability_transform_of_the_right_gaussians_is_uniform():
+    mean, std = randn(20_000, seed=1), randn(20_000, seed=2).abs() + 0.1
+    pit = gaussian_pit(mean + std * randn(20_000, seed=3), mean, std)
+    grid = (torch.arange(20_000) + 0.5) / 20_000
+    assert (pit.sort().values - grid).abs().max() < 1.63 / 20_000**0.5  # Kolmogorov and Smirnov
+
+
+@pytest.mark.parametrize("std", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("value", [-2.5, 0.3, 4.0])
+def test_the_crps_equals_the_integral_of_its_definition(value, std):
+    mean, total = 0.5, 0.0
+    # The integrand jumps at the value: each side by itself, trapezoids on both.
+    for low, high, step in ((mean - 12 * std - 10, value, 0.0), (value, mean + 12 * std + 10, 1.0)):
+        y = torch.linspace(low, high, 400_001, dtype=torch.float64)
+        gap = torch.special.ndtr((y - mean) / std) - step
+        total += torch.trapezoid(gap.square(), y).item()
+    crps = gaussian_crps(*(torch.tensor(v, dtype=torch.float64) for v in (value, mean, std)))
+    assert crps.item() == pytest.approx(total, rel=1e-7)
+
+
+def test_the_crps_without_a_spread_is_the_absolute_error():
+    value, mean = randn(10, seed=1), randn(10, seed=2)
+    zero = torch.zeros(10, dtype=torch.float64)
+    torch.testing.assert_close(gaussian_crps(value, mean, zero), (value - mean).abs())
+    assert (gaussian_crps(value, value, zero) == 0).all()
+
+
+@pytest.mark.parametrize("score", [gaussian_crps, gaussian_log_score])
+def test_no_other_deviation_or_mean_scores_better_than_the_right_one(score):
+    value = randn(50_000, seed=7)
+
+    def mean_score(mean: float, std: float) -> float:
+        return score(value, torch.tensor(mean), torch.tensor(std)).mean().item()
+
+    others = [(0.0, 0.7), (0.0, 1.4), (0.3, 1.0), (-0.3, 1.0)]
+    assert all(mean_score(*other) > mean_score(0.0, 1.0) for other in others)
+
+
+def test_the_log_score_of_an_entry_is_minus_its_log_density():
+    value, mean, std = randn(9, seed=1), randn(9, seed=2), randn(9, seed=3).abs() + 0.1
+    expected = -torch.distributions.Normal(mean, std).log_prob(value)
+    torch.testing.assert_close(gaussian_log_score(value, mean, std), expected)

@@ -41,7 +41,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     trained: TrainedAgent, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
     point, protocol = parse("mcar:0.5", trained.settings), Protocol(3, 1, 0, 1, None)
-    expected = evaluate_condition(trained, point, ["sampled"], protocol)
+    expected = evaluate_condition(trained, point, ["sampled"], protocol).to_dict("records")
     step, calls, actions = BeliefFilter.step, [], []
 
     def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
@@ -58,9 +58,9 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     advance = GymnasiumBatchEnv._advance
     monkeypatch.setattr(BeliefFilter, "step", diverge)
     monkeypatch.setattr(GymnasiumBatchEnv, "_advance", look)
-    found = evaluate_condition(trained, point, ["sampled"], protocol)
+    found = evaluate_condition(trained, point, ["sampled"], protocol).to_dict("records")
     assert [row["diverged"] for row in found] == [0, 1, 0]
-    assert found[1]["log_likelihood"] is None
+    assert np.isnan(found[1]["log_likelihood"])
     assert np.isfinite([row["return"] for row in found]).all()
     for row in (0, 2):
         assert found[row] == expected[row]
@@ -87,7 +87,9 @@ def test_the_belief_of_an_episode_that_is_over_goes_no_further(
     monkeypatch.setattr(BeliefFilter, "step", look)
     point = parse("mcar:0.5", trained.settings)
     if command == "evaluate":
-        rows = evaluate_condition(trained, point, ["sampled"], Protocol(4, 1, 0, 1, None))
+        rows = evaluate_condition(trained, point, ["sampled"], Protocol(4, 1, 0, 1, None)).to_dict(
+            "records"
+        )
         lengths = [row["length"] for row in rows]
     else:
         tally = diagnose(trained, point, episodes=4, mode="sampled", seed=1, bins=[1, 2])

@@ -7,8 +7,6 @@ saved state as if it had never stopped.
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 import torch
 from torch import Tensor, nn
@@ -196,31 +194,6 @@ def test_the_steps_are_averaged_by_momentum():
 
 
 # The state ------------------------------------------------------------------------------------
-
-
-def test_a_saved_state_goes_on_to_the_last_bit(generator):
-    module = network(generator, 3, 4, 2)
-    numbers = {**NUMBERS, "lr": 0.1, "momentum": 0.9, "damping": 1e-2, "max_kl": 1e-2}
-    optimizer = KFAC(module, **numbers)
-    batches = [[normal(generator, N, 3), *normal(generator, 2, N, 2)] for _ in range(6)]
-
-    def learn(optimizer: KFAC, module: nn.Module, inputs: Tensor, noise: Tensor, y: Tensor) -> None:
-        output = observe(optimizer, module, inputs, noise)
-        optimizer.zero_grad()
-        (output - y).square().mean().backward()
-        optimizer.step()
-
-    for batch in batches[:3]:
-        learn(optimizer, module, *batch)
-    other = copy.deepcopy(module)
-    saved = copy.deepcopy(optimizer.state_dict())
-    again = KFAC(other, **numbers)
-    again.load_state_dict(saved)
-    for batch in batches[3:]:
-        learn(optimizer, module, *batch)
-        learn(again, other, *batch)
-    for mine, theirs in zip(module.parameters(), other.parameters(), strict=True):
-        assert torch.equal(mine, theirs)
 
 
 def test_a_step_before_any_curvature_is_refused(generator):

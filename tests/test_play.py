@@ -287,32 +287,6 @@ def test_another_belief_shows_what_it_says_and_no_more(
 # Bad input ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"run": None}, "`run` must name a run folder"),
-        ({"point": "mcar:2"}, "`points` must hold"),
-        ({"mode": "best"}, "`modes` must hold"),
-        ({"steps": 0}, r"`steps` must be in \[1, inf\], got 0"),
-        ({"start": -1}, r"`start` must be in \[0, inf\], got -1"),
-        ({"start": 100_000}, "`start` must lie inside the episode"),
-        ({"fps": 60}, r"`fps` must be in \[1, 50\], got 60"),
-        ({"sensors": ["pole"]}, "`sensors` must be among 0 cart position, .*got 'pole'"),
-        ({"sensors": [4]}, "`sensors` must be among .*got 4"),
-        ({"sensors": 0}, "`sensors` must be 1 or more"),
-        ({"out": "nowhere/film.gif"}, "`out` must lie in an existing folder"),
-        ({"out": "film.avi"}, r"`out` must end in .gif, .mp4 or .png, got film.avi"),
-    ],
-)
-def test_bad_input_is_answered_with_one_line(
-    drbpn: Path, tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(UserError, match=message) as caught:
-        show(drbpn, **({"out": tmp_path / "film.gif"} | changes))
-    assert "\n" not in str(caught.value)
-    assert not list(tmp_path.iterdir())
-
-
 def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(drbpn: Path) -> None:
     length = len(record(drbpn, steps=100_000).steps)
     with pytest.raises(UserError, match=f"`start` must lie .* after {length} steps"):

@@ -37,7 +37,6 @@ from torchrl_drbpn import (
     GaussianTransition,
     LinearGaussianEmission,
     functional,
-    select_sensors,
 )
 
 OBS, ACTION = 11, 3
@@ -126,11 +125,6 @@ def test_the_kept_sensors_are_the_first_of_the_ranking(
         assert kept_sensors(agents[0], count) == ranking[:count]
 
 
-def test_a_belief_without_a_model_is_refused(feedforward: Path) -> None:
-    with pytest.raises(UserError, match="`belief=none` has learned no H, P and R"):
-        kept_sensors(load_trained_agent(feedforward), 3)
-
-
 def test_a_covariance_that_depends_on_the_state_ranks_no_sensors(runs: list[Path]) -> None:
     trained = load_trained_agent(runs[0])
     trained.agent.belief.filter.transition = GaussianTransition(OBS, ACTION, cov_network=True)
@@ -161,18 +155,6 @@ def test_along_an_order_is_what_update_leaves(models: list[SensorModel], full: b
             share = (H @ cov @ H.mT).trace() / (H @ P @ H.mT).trace()
             assert information[line, k] == pytest.approx(float(gained), abs=1e-9)
             assert left[line, k] == pytest.approx(float(share), abs=1e-9)
-
-
-def test_along_the_chosen_orders_is_what_select_sensors_says(models: list[SensorModel]) -> None:
-    model = models[2]
-    H, P, R = model.emission_matrix, model.predicted_cov, model.emission_cov
-    chosen = select_sensors(H, P, R, OBS)
-    assert torch.equal(model.ranking("D"), chosen.indices)
-    torch.testing.assert_close(model.along(chosen.indices)[0], chosen.information)
-    chosen = select_sensors(H, P, R, OBS, criterion="A", target=H)
-    assert torch.equal(model.ranking("A"), chosen.indices)
-    share = chosen.objective / (H @ P @ H.mT).trace()
-    torch.testing.assert_close(model.along(chosen.indices)[1], share)
 
 
 def test_mean_places_count_from_one(models: list[SensorModel]) -> None:
@@ -249,30 +231,3 @@ def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(
     wide = imread(copied / FILES[0]).shape[1]
     assert draw(str(copied), None) == 0
     assert imread(copied / FILES[0]).shape[1] > 1.5 * wide  # the correlations stand beside
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"run": None}, "`run` must name run folders"),
-        ({"run": "nowhere/*"}, "`run` must name run folders, nowhere/\\* matches none"),
-        ({"run": "nowhere"}, "there is no folder nowhere"),
-        ({"orders": 5}, "`orders` must be 20 or more"),
-        ({"dpi": 0}, "`dpi` 1 or more"),
-        ({"out": __file__}, "`out` must be a folder, .* is a file"),
-    ],
-)
-def test_bad_input_is_answered_with_one_line(
-    runs: list[Path], tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(UserError, match=message) as caught:
-        draw(**({"run": str(runs[0]), "out": tmp_path / "out"} | changes))
-    assert "\n" not in str(caught.value)
-    assert not list(tmp_path.iterdir())
-
-
-def test_several_runs_need_a_folder_and_one_without_a_model_is_refused(runs: list[Path]) -> None:
-    with pytest.raises(UserError, match="`out` must name a folder for 2 runs"):
-        draw([str(folder) for folder in runs[:2]], None)
-    with pytest.raises(UserError, match="`belief=none` has learned no H, P and R"):
-        draw(str(runs[3]), None)

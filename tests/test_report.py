@@ -22,14 +22,14 @@ pytest.importorskip("matplotlib")
 from recipe_tools import ROOT, make_config  # isort: skip
 
 from analysis.figures import draw_evaluation, episode_summary
-from analysis.runs import over_episodes, read_runs, write_table
+from analysis.runs import read_runs, write_table
 from analysis.statistics import interquartile_mean, interval, probability_of_improvement, ratio
 from analysis.tables import derived_tables, point_kind, point_order
+from evaluation.episodes import over_episodes
+from evaluation.points import method_name, missingness_name
 from omegaconf import OmegaConf
 from report import run
-from training.config import missingness_name
 from training.errors import UserError
-from training.methods import method_name
 from training.run_folder import read_config, write_config
 
 ASKED = {"run": None, "out": None, "from": None, "title": None}
@@ -202,7 +202,9 @@ def test_a_share_is_a_ratio_of_means(tmp_path: Path) -> None:
 
 def test_episodes_are_summed_up_over_their_steps() -> None:
     table = pd.DataFrame(episodes({"mcar:0.5": (1.0, 2.0)})).assign(missing_ratio=[0.2, 0.6])
-    found = over_episodes(table.assign(log_likelihood=[1.0, 2.0], diverged=[0, 1])).iloc[0]
+    found = over_episodes(table.assign(log_likelihood=[1.0, 2.0], diverged=[0, 1]), ["point"]).iloc[
+        0
+    ]
     assert found.missing_ratio == pytest.approx((0.2 * 10 + 0.6 * 30) / 40)
     assert found.log_likelihood == pytest.approx((1.0 * 8 + 2.0 * 12) / 20)
     assert (found.return_mean, found.diverged, found.episodes) == (1.5, 0.5, 2)
@@ -402,24 +404,6 @@ def test_runs_that_are_not_finished_are_refused_unless_asked_for(tmp_path: Path)
     (folder / "evaluation.csv").unlink()
     with pytest.raises(UserError, match="lacks its final evaluation"):
         report([folder], tmp_path / "out")
-
-
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        ({"run": "nowhere/*"}, r"`run` must name run folders, nowhere/\* matches none"),
-        ({"run": "nowhere"}, "`run` must name run folders, there is no folder nowhere"),
-        ({"run": None}, "`run` must name run folders: run="),
-        ({"run": [], "out": None}, "`out` must be the folder of a study"),
-        ({"from": "nowhere"}, "`from` reads and writes the tables of a study: leave out `run`"),
-        ({"from": "nowhere", "run": None, "out": None}, "`from` must name folders with a runs.csv"),
-        ({"rows": 1}, "`rows` must be a whole number of at least 2, got 1"),
-    ],
-)
-def test_bad_options_are_one_line(options: dict[str, Any], line: str, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=line) as error:
-        run(ASKED | {"run": "x", "out": str(tmp_path / "out")} | options)
-    assert "\n" not in str(error.value)
 
 
 def test_a_bad_folder_is_one_line_and_the_old_report_stays(

@@ -29,14 +29,13 @@ from recipe_tools import CONF, ROOT, command, differences, make_config, read_tab
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra_plugins.cell_sweeper import CellSweeper
+from hydra_plugins.cell_sweeper import CellSweeper, continued, run_cell
 from omegaconf import DictConfig, OmegaConf
 from ppo_drbpn import train
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.console import STOP_FILE, StopRequest
 from training.errors import UserError
-from training.sweep import continued, run_cell
 
 STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))

@@ -130,41 +130,6 @@ def test_features_depend_on_as_many_steps_as_the_layers_reach_back(window, layer
     assert torch.equal(reach(module, make_frames(2, 9)), expected)
 
 
-def test_the_window_is_the_same_one_step_at_a_time():
-    module = make_module()
-    frames = make_frames(1, 9)
-    expected = in_steps(module, frames)["features"]
-    for changed in range(9):
-        other = frames.clone()
-        other["normalized_observation"][:, changed] += 1.0
-        moved = (in_steps(module, other)["features"] != expected).any(-1)[0]
-        assert torch.equal(moved, band(9, 3)[:, changed])
-
-
-@pytest.mark.parametrize("distance", [0, 1, 3])
-def test_the_position_of_a_distance_is_that_of_the_step_so_far_back(distance):
-    module = make_module()
-    attention = module.layers[0].attention
-    with torch.no_grad():
-        attention.query.weight.zero_()
-        nn.init.normal_(attention.query.bias)
-        # What every head, asking the same always, turns away from.
-        asked = attention.query.bias.reshape(4, 1, 4) @ attention.key.weight.reshape(4, 4, 16)
-        away = torch.linalg.pinv(asked.squeeze(1)) @ torch.full((4,), -1e6, dtype=torch.float64)
-        attention.position.copy_(away)
-        attention.position[3 - distance] = 0.0  # oldest first
-    time = torch.arange(9)
-    expected = torch.eye(9, dtype=torch.bool)
-    # The step itself always passes by the attention; earlier ones through it alone.
-    expected[time[distance:], time[: 9 - distance]] = True
-    frames = make_frames(1, 9)
-    # Before there were so many steps, all that is seen has the same position.
-    assert torch.equal(reach(module, frames)[distance:], expected[distance:])
-    with set_recurrent_mode(True):
-        sequence = module(frames.clone())["features"]
-    torch.testing.assert_close(in_steps(module, frames)["features"], sequence)
-
-
 # --- episodes
 def test_an_episode_start_hides_what_lay_before():
     module = make_module(layers=2)
@@ -230,30 +195,6 @@ def test_no_gradient_flows_into_the_memory():
             out = module(frames.clone())
         assert out["features"].requires_grad
         assert not out["next", *MEMORY].requires_grad
-
-
-@pytest.mark.slow
-def test_it_learns_to_repeat_what_arrived_some_steps_ago():
-    module = make_module(window=5, layers=1)
-    head = nn.Linear(16, 1, dtype=torch.float64)
-    optimizer = torch.optim.Adam([*module.parameters(), *head.parameters()], 1e-2)
-    g = torch.Generator().manual_seed(0)
-    losses = []
-    for _ in range(250):
-        frames = make_frames(16, 12)
-        frames["normalized_observation"] = torch.randn(
-            16, 12, OBS, generator=g, dtype=torch.float64
-        )
-        with set_recurrent_mode(True):
-            out = head(module(frames)["features"]).squeeze(-1)
-        loss = (out[:, 4:] - frames["normalized_observation"][:, 1:-3, 0]).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    # The variance of what is to be repeated is 1.
-    assert losses[0] > 0.8
-    assert sum(losses[-20:]) / 20 < 0.1
 
 
 # --- sizes

@@ -86,12 +86,9 @@ class Tally:
         return 1 - (self.observed.sum() / (self.lengths.sum() * self.components)).item()
 
     def add(self, rows: slice, steps: Mapping[str, Tensor]) -> None:
-        """Add steps to the sums.
+        """Add the steps of some episodes to the sums, by names such as ``observed`` and ``class``.
 
-        Args:
-            rows: the episodes.
-            steps: each ``(episodes of the rows, time, obs[, obs])``: ``observed``, ``running``,
-                ``class``, `READING`, `TRUTH`, the estimates, and what gives them a variance.
+        Each is of shape ``(episodes of the rows, time, obs[, obs])``.
         """
         running = steps["running"]
         masks = {ARRIVED: steps["observed"] & running, MISSING: ~steps["observed"] & running}
@@ -228,11 +225,7 @@ def diagnose(
 
 
 def class_names(bins: Sequence[int]) -> list[str]:
-    """Name the classes of steps since last seen, such as ``3``, ``6-10``, ``51+``, and ``never``.
-
-    Raises:
-        UserError: if ``bins``, where they begin, do not start at 1 and ascend.
-    """
+    """Name the classes of steps since last seen, such as ``3``, ``6-10``, ``51+``, ``never``."""
     pairs = list(itertools.pairwise(bins))
     if not bins or {*map(type, bins)} != {int} or bins[0] != 1 or any(a >= b for a, b in pairs):
         raise UserError(f"`bins` must be whole numbers that start at 1 and ascend, got {bins}.")

@@ -28,8 +28,7 @@ _Draw = Callable[[Any, pd.DataFrame, str, str, int], None]
 def precision_figure(table: pd.DataFrame) -> Figure | None:
     """Draw precision.csv: the error of every estimate over the steps since last seen.
 
-    Returns:
-        One column a task and one row a point; None where there is nothing to draw.
+    One column a task and one row a point; None where there is nothing to draw.
     """
     rows = table[(table["steps_since_seen"] != "all") & (table["count"] >= _FEWEST)]
 
@@ -46,9 +45,7 @@ def precision_figure(table: pd.DataFrame) -> Figure | None:
 def outage_figure(table: pd.DataFrame) -> Figure | None:
     """Draw calibration.csv: forecasts of what arrives, by the steps since it was last seen.
 
-    Returns:
-        A row a task and point, and in it NIS over entries, coverage and CRPS; None where no belief
-        forecasts what arrives.
+    A row a task and point: NIS over entries, coverage and CRPS; None where nothing is forecast.
     """
     wanted = (table["held_against"] == "reading") & (table["steps_since_seen"] != "all")
     rows = table[wanted & (table["count"] >= _FEWEST)]

@@ -23,11 +23,6 @@ class Resampling:
     the 95 % percentiles are too narrow (91 % of ten); the interval takes those that a Student
     interval of a mean would reach: :math:`\Phi(\mp t_{n-1} \sqrt{n / (n - 1)})`, the expanded
     percentile interval of Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015.
-
-    Args:
-        episodes: how many there are.
-        resamples: how often to draw as many.
-        seed: of the draws.
     """
 
     def __init__(self, episodes: int, resamples: int, seed: int) -> None:
@@ -42,13 +37,10 @@ class Resampling:
         denominator: Tensor,
         then: Callable[[Any], Any] = float,
     ) -> Row:
-        """Return a ratio of sums over episodes and its 95 % interval, as three columns.
+        """Return a ratio of sums over episodes and its 95 % interval: ``name``, its low and high.
 
-        Args:
-            name: of the columns: ``name``, ``name_low``, ``name_high``.
-            numerator: sums of each episode, shape ``(episodes,)``; None: all three are empty.
-            denominator: the same shape. The ends are None where fewer than two episodes count.
-            then: monotonous, applied to the ratio and its ends.
+        ``then`` is monotonous, applied to all three. Without a numerator all are None; the ends
+        also where fewer than two episodes count.
         """
         value = low = high = None
         if numerator is not None and denominator.sum() > 0:

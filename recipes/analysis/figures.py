@@ -65,16 +65,11 @@ def learning_curves(training: pd.DataFrame) -> Figure | None:
 
 
 def robustness(summary: pd.DataFrame, *, rows: str, columns: str) -> Figure | None:
-    """Draw return under every condition, a panel a pair of values of two columns.
+    """Draw return under every condition, a panel a pair of values of two columns of a summary.
 
-    Args:
-        summary: such as :func:`analysis.tables.summarise` returns.
-        rows: ``kind`` (of the conditions), ``mode`` or ``task``: what the rows of panels differ in.
-        columns: the same of the columns.
-
-    Returns:
-        The figure, the realised missing ratio on the axis, nominal levels in grey; outages, noise
-        and spikes by their level. None where no kind has two levels.
+    ``rows`` and ``columns`` of panels differ in ``kind`` (of the conditions), ``mode`` or ``task``.
+    The realised missing ratio is on the axis, nominal levels in grey; outages, noise and spikes are
+    by their level. None where no kind has two levels.
     """
     table = summary[summary.point != "training"]
     table = table.assign(label=_labels(table), kind=[point_kind(p)[0] for p in table.point])
@@ -118,10 +113,9 @@ def _points(axis: Any, points: pd.DataFrame, colour: str, label: str, *, nominal
 def episode_summary(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum up the table of recipes/evaluate.py, one row an episode, for :func:`robustness`.
 
-    Returns:
-        Rows by agent, point and kind of action: the mean return and its 95 % bootstrap interval,
-        over runs where there are several, else over the episodes of the one. Runs that share
-        method, task and training seed are distinguished by their names.
+    Rows by agent, point and kind of action: the mean return and its 95 % bootstrap interval, over
+    runs where there are several, else over the episodes of the one. Runs that share method, task
+    and training seed are distinguished by their names.
     """
     # The noise of the condition stands in its name.
     episodes = episodes.drop(columns="noise_sigma", errors="ignore")

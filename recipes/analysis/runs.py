@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from evaluation.episodes import over_episodes
+from evaluation.points import faults_name, method_name, missingness_name
 from scipy.stats import hmean
-from training.config import faults_name, missingness_name
 from training.errors import UserError
-from training.methods import method_name
 from training.run_folder import read_config
 
 # A mean is taken over the seeds of one of these.
@@ -82,11 +82,7 @@ def write_table(path: Path, rows: Any) -> None:
 
 
 def read_table(path: Path, needed: Iterable[str]) -> pd.DataFrame:
-    """Read a CSV file; a last row without an end, of a run under way, is left out.
-
-    Raises:
-        UserError: if it can't be read or lacks one of the columns ``needed``.
-    """
+    """Read a CSV file; a last row without an end, of a run under way, is left out."""
     try:
         text = path.read_text(encoding="utf-8")
         whole = io.StringIO(text[: text.rfind("\n") + 1])
@@ -105,20 +101,16 @@ def read_runs(
     rows: int = 100,
     unfinished: bool = False,
 ) -> Study:
-    """Read run folders.
+    """Read run folders, and a ``further`` table of recipes/evaluate.py over several runs.
 
     Args:
         folders: run folders.
-        further: table of recipes/evaluate.py over several runs.
+        further: path of the table.
         rows: of a learning curve.
         unfinished: whether runs that are not at their end are taken as they stand.
 
-    Returns:
-        Their tables. ``settings`` lists what differs between runs of one task, method and
-        corruption beside the seed: such runs are never averaged.
-
-    Raises:
-        UserError: if a folder can't be read, a run is not finished, or two are the same.
+    ``settings`` of what comes back lists what differs between runs of one task, method and
+    corruption beside the seed: such runs are never averaged.
     """
     configs = [read_config(folder) for folder in folders]
     needed = ["frames", "return", "missing_ratio"]
@@ -194,40 +186,16 @@ def _evaluations(
     own = own.rename(columns={"kind": "source"})
     tables = [own.assign(point=missingness_name(config["missingness"]), table=path.name)]
     if shared is not None:
-        tables.append(over_episodes(shared[shared.run == folder.name], "over several runs"))
+        tables.append(_over_episodes(shared[shared.run == folder.name], "over several runs"))
     paths = [folder / name for name in EPISODE_TABLES if (folder / name).is_file()]
-    tables += [over_episodes(read_table(path, _EPISODE), path.name) for path in paths]
+    tables += [_over_episodes(read_table(path, _EPISODE), path.name) for path in paths]
     rows = pd.concat([table for table in tables if len(table)] or tables)
     return rows.reindex(columns=_EVALUATION).drop_duplicates(["source", "frames", "point", "mode"])
 
 
-def over_episodes(episodes: pd.DataFrame, table: str = "") -> pd.DataFrame:
-    """Sum up a table of recipes/evaluate.py, of one run, over the episodes of a condition.
-
-    Rows as in evaluation.csv; missing ratio and log-likelihood are over all steps and entries.
-    """
-    arrived = episodes.length * (1 - episodes.missing_ratio)
-    nats = arrived * episodes.get("log_likelihood", np.nan)
-    rows = (
-        episodes.assign(arrived=arrived, nats=nats, diverged=episodes.get("diverged", 0.0))
-        .groupby(["frames", "point", "mode"], sort=False, as_index=False)
-        .agg(
-            episodes=("return", "size"),
-            return_mean=("return", "mean"),
-            return_std=("return", "std"),
-            length_mean=("length", "mean"),
-            steps=("length", "sum"),
-            arrived=("arrived", "sum"),
-            nats=("nats", lambda values: values.sum(skipna=False)),
-            diverged=("diverged", "mean"),
-        )
-    )
-    return rows.assign(
-        source="points",
-        table=table,
-        missing_ratio=1 - rows.arrived / rows.steps,
-        log_likelihood=rows.nats / rows.arrived.clip(lower=1e-12),
-    )
+def _over_episodes(episodes: pd.DataFrame, table: str) -> pd.DataFrame:
+    rows = over_episodes(episodes, ["frames", "point", "mode"])
+    return rows.assign(source="points", table=table)
 
 
 def _thinned(curve: pd.DataFrame, rows: int) -> pd.DataFrame:

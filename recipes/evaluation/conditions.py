@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,15 +10,20 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
-from training.config import GROUPINGS, choice, missingness_kind, missingness_name
+from training.config import build, choice
 from training.errors import UserError
 
+from evaluation.points import (
+    FAULTS,
+    condition_name,
+    missingness_kind,
+    missingness_name,
+    read_fields,
+)
 from evaluation.sensor_choice import kept_sensors
 from evaluation.trained import TrainedAgent
-from torchrl_drbpn.functional import outage_rates
 
 _MECHANISMS = ("none", "mcar", "mar", "nmar")
-_SELECTIONS = ("model", "random")
 
 
 @dataclass(frozen=True)
@@ -65,70 +69,48 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
     ``spike_std`` is the deviation of spikes where the text gives none, raw units.
     """
     missing, noise = settings.missingness, settings.noise
-    match text.split(":"):
-        case ["trained"]:
-            return Condition(missingness_name(missing), missingness_kind(missing), missing, noise)
-        case ["noise", level] if (sigma := _number(level)) is not None:
-            return Condition(f"noise:{sigma:g}", "noise", missing, _with(noise, sigma=sigma))
-        case ["spikes", share, *rest] if (p := _number(share, 1.0)) is not None and len(rest) < 2:
-            std = _number(rest[0]) if rest else spike_std
-            if std is not None:
-                spiked = _with(noise, spike_probability=p, spike_std=std)
-                return Condition(f"spikes:{p:g}:{std:g}", "spikes", missing, spiked)
-        case ["stuck", share, *rest] if (p := _number(share, 1.0)) is not None and len(rest) < 3:
-            length, by = _number(rest[0]) if rest else 20.0, rest[1] if rest[1:] else "sensor"
-            if length is not None and length >= 1 and by in GROUPINGS:
-                stuck = {"stuck_probability": p, "stuck_mean_length": length, "group_by": by}
-                frozen = _with(noise, **stuck, id="${env.id}", version="${env.version}")
-                return Condition(f"stuck:{p:g}:{length:g}:{by}", "stuck", missing, frozen)
-        case ["drift", level, *rest] if (std := _number(level)) is not None and len(rest) < 2:
-            rate = _number(rest[0], least=-math.inf) if rest else 0.0
-            if rate is not None:
-                drifting = _with(noise, drift_std=std, drift_rate=rate)
-                return Condition(f"drift:{std:g}:{rate:g}", "drift", missing, drifting)
-        case ["delay", level, *rest] if (least := _whole(level)) is not None and len(rest) < 4:
-            most, by = _whole(rest[0]) if rest else least, rest[1] if rest[1:] else "sensor"
-            if (
-                most is not None
-                and most >= least
-                and by in GROUPINGS
-                and rest[2:] in ([], ["in_order"])
-            ):
-                random = {"max_delay": most, "group_by": by} if rest else {}
-                late = choice(
-                    "missingness", "delay", delay=least, in_order=bool(rest[2:]), **random
-                )
-                return Condition(missingness_name(late), "delay", late, noise)
-        case ["multi_rate", level, *rest] if (n := _whole(level)) and len(rest) < 3:
-            by, phase = rest[0] if rest else "sensor", _whole(rest[1]) if rest[1:] else None
-            if by in GROUPINGS and (not rest[1:] or (phase is not None and phase < n)):
-                rated = choice("missingness", "multi_rate", period=n, phase=phase, group_by=by)
-                return Condition(missingness_name(rated), "multi_rate", rated, noise)
-        case ["reduction", share, by] if (r := _number(share, 1.0)) is not None:
-            if by in _SELECTIONS:
-                nothing = choice("missingness", "none")
-                return Condition(f"reduction:{r:g}:{by}", "reduction", nothing, noise, r, by)
-        case ["outages", share, length, *rest] if len(rest) < 2:
-            eta, mean, by = _number(share, 1.0), _number(length), rest[0] if rest else "sensor"
-            if eta is not None and mean is not None and by in GROUPINGS:
-                out = choice("missingness", "outages", eta=eta, mean_length=mean, group_by=by)
-                try:
-                    outage_rates(eta, mean)
-                except ValueError as error:
-                    raise UserError(f"missingness=outages: {error}") from error
-                return Condition(missingness_name(out), "outages", out, noise)
-        case [family, share] if family in _MECHANISMS and (eta := _number(share, 1.0)) is not None:
-            changed = _mechanism(family, eta, missing)
-            return Condition(missingness_name(changed), family, changed, noise)
-    raise UserError(
-        "`points` must hold trained or mechanism:eta such as mcar:0.5, with one of none, mcar, "
-        "mar, nmar and eta in [0, 1], outages:eta:mean_length[:sensor, joint or kind], "
-        "delay:steps[:most[:sensor, joint or kind[:in_order]]], "
-        "multi_rate:period[:sensor, joint or kind[:phase]], "
-        "reduction:ratio:model or random, noise:sigma, spikes:probability[:std], "
-        "stuck:probability[:mean_length[:sensor, joint or kind]] or drift:std[:rate]; "
-        f"got {text!r}."
-    )
+    if text == "trained":
+        return Condition(missingness_name(missing), missingness_kind(missing), missing, noise)
+    family, *words = text.split(":")
+    values = read_fields(family, words)
+    if values is None:
+        raise UserError(
+            "`points` must hold trained or mechanism:eta such as mcar:0.5, with one of none, mcar, "
+            "mar, nmar and eta in [0, 1], outages:eta:mean_length[:sensor, joint or kind], "
+            "delay:steps[:most[:sensor, joint or kind[:in_order]]], "
+            "multi_rate:period[:sensor, joint or kind[:phase]], "
+            "reduction:ratio:model or random, noise:sigma, spikes:probability[:std], "
+            "stuck:probability[:mean_length[:sensor, joint or kind]] or drift:std[:rate]; "
+            f"got {text!r}."
+        )
+    if family in ("noise", *FAULTS):
+        if family == "spikes" and values["spike_std"] is None:
+            values["spike_std"] = spike_std
+        name = condition_name(family, values)
+        task = {"id": "${env.id}", "version": "${env.version}"} if "group_by" in values else {}
+        noise = OmegaConf.create({str(key): noise[key] for key in noise} | values | task)
+    elif family == "reduction":
+        name, missing = condition_name(family, values), choice("missingness", "none")
+    else:
+        trained = {} if family not in _MECHANISMS else missing
+        missing = choice("missingness", family, **({} if family == "none" else values))
+        for key in {"always_observed", "mechanism_seed"} & {*missing} & {*trained}:
+            missing[key] = trained[key]
+        name = missingness_name(missing)
+    _check(text, settings, missing, noise)
+    taken = values if family == "reduction" else {}
+    return Condition(name, family, missing, noise, **taken)
+
+
+def _check(text: str, settings: DictConfig, missingness: DictConfig, noise: DictConfig) -> None:
+    """Let the transforms of a condition say what they refuse before any episode."""
+    changed = settings.copy()
+    changed.missingness, changed.noise = missingness, noise
+    try:
+        for group in ("missingness", "noise"):
+            build(group, changed[group])
+    except UserError as error:
+        raise UserError(f"`points` must hold other numbers than {text!r}: {error}") from error
 
 
 def parse_conditions(
@@ -151,7 +133,9 @@ def default_conditions(
     ratios = [ratio for ratio in levels["ratios"] if ratio > 0]
     out = ["none:0"] if len(ratios) < len(levels["ratios"]) else []
     out += [f"{f}:{r:g}" for f in ("mcar", "mar", "nmar")[: 3 if full else 2] for r in ratios]
-    out += [f"reduction:{r:g}:{by}" for by in _SELECTIONS[0 if model else 1 :] for r in ratios]
+    out += [
+        f"reduction:{r:g}:{by}" for by in ("model", "random")[0 if model else 1 :] for r in ratios
+    ]
     if full:
         out += [
             f"outages:{ratio:g}:{length:g}:{by}"
@@ -194,31 +178,3 @@ def removed_sensors(
         order = np.random.default_rng((reduction_seed, episode)).permutation(trained.obs_dim)
         row[torch.from_numpy(order[:count])] = True
     return removed
-
-
-def _with(node: DictConfig, **values: Any) -> DictConfig:
-    """Return a node of the configuration with other or further values."""
-    return OmegaConf.create({str(key): node[key] for key in node} | values)
-
-
-def _mechanism(family: str, eta: float, trained: DictConfig) -> DictConfig:
-    """Return missingness of another family; what both have stays as in training."""
-    node = choice("missingness", family, **({} if family == "none" else {"eta": eta}))
-    for key in ("always_observed", "mechanism_seed"):
-        if key in node and key in trained:
-            node[key] = trained[key]
-    return node
-
-
-def _whole(text: str) -> int | None:
-    """Read a whole number from 0; None where there is none."""
-    return int(text) if text.isdecimal() else None
-
-
-def _number(text: str, most: float = math.inf, *, least: float = 0.0) -> float | None:
-    """Read a number from ``least`` to ``most``; None where there is none."""
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if least <= value <= most and math.isfinite(value) else None

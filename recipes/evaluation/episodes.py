@@ -7,11 +7,12 @@ the seed alone, to the bit, so that more episodes only add to fewer.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -30,52 +31,6 @@ _FARTHEST = 1e6
 Watch = Callable[[slice, TensorDictBase, Tensor], None]
 
 
-@dataclass(frozen=True)
-class Episodes:
-    """Whole episodes of one policy under one corruption.
-
-    Attributes:
-        returns: sum of raw rewards of each episode.
-        lengths: steps of each episode.
-        missing_ratios: share of entries that did not arrive in each, over all components.
-        log_likelihoods: nats per observed entry in each, normalised units; None without a model.
-        diverged: whether the belief left the range of its numbers and the robot was stopped.
-    """
-
-    returns: list[float]
-    lengths: list[int]
-    missing_ratios: list[float]
-    log_likelihoods: list[float] | None
-    diverged: list[bool]
-
-    @property
-    def mean_return(self) -> float:
-        """Return the mean of the returns."""
-        return float(np.mean(self.returns))
-
-    @property
-    def std_return(self) -> float:
-        """Return the standard deviation of the returns between episodes; 0 for one episode."""
-        return float(np.std(self.returns, ddof=1)) if len(self.returns) > 1 else 0.0
-
-    @property
-    def missing_ratio(self) -> float:
-        """Return the share of entries that did not arrive, over all steps and components."""
-        return float(np.average(self.missing_ratios, weights=self.lengths))
-
-    @property
-    def log_likelihood(self) -> float | None:
-        """Return the nats per observed entry over all steps; None without a model, or diverged.
-
-        0 where nothing arrived.
-        """
-        if self.log_likelihoods is None or any(self.diverged):
-            return None
-        arrived = (1 - np.array(self.missing_ratios)) * np.array(self.lengths)
-        # The weights are counts over the number of components: one entry of many is below 1.
-        return float(arrived @ np.array(self.log_likelihoods) / max(arrived.sum(), 1e-12))
-
-
 def evaluate(
     policy: TensorDictModuleBase,
     make_env: Callable[[int], TransformedEnv],
@@ -84,36 +39,64 @@ def evaluate(
     mode: str,
     seed: int,
     stop: Callable[[], bool] = lambda: False,
-) -> Episodes | None:
-    """Run episodes, see :func:`run_episodes`, and sum up each; None if they were given up."""
-    returns, likelihoods = torch.zeros(2, episodes, dtype=torch.float64)
-    lengths, entries, observed = torch.zeros(3, episodes, dtype=torch.int64)
-    diverged = torch.zeros(episodes, dtype=torch.bool)
-    has_model = False
+) -> pd.DataFrame | None:
+    """Run episodes, see :func:`run_episodes`, one row each; None if they were given up.
+
+    ``return`` sums raw rewards; ``missing_ratio`` is the share of entries that did not arrive;
+    ``log_likelihood`` nats per observed entry, normalised units, NaN without a model or where the
+    belief ``diverged``: where it left the range of its numbers and the robot was stopped.
+    """
+    names = ("return", "length", "entries", "arrived", "nats", "diverged")
+    sums = torch.zeros(len(names), episodes, dtype=torch.float64)
 
     def add(rows: slice, data: TensorDictBase, running: Tensor) -> None:
-        nonlocal has_model
-        mask, value = data.get("observed"), data.get(("belief", "log_likelihood"), None)
-        lengths[rows] += running
-        entries[rows] += running * mask.shape[-1]
-        observed[rows] += running * mask.sum(-1)
-        returns[rows] += running * data.get(("next", "reward")).squeeze(-1)
-        if value is not None:
-            has_model = True
-            likelihoods[rows] += running * value.reshape(-1)
-        if "diverged" in data.keys():  # noqa: SIM118 - a tensordict is no dictionary
-            diverged[rows] |= running & data.get("diverged").squeeze(-1)
+        mask, one = data.get("observed"), torch.ones(len(running), dtype=torch.float64)
+        nats, diverged = data.get(("belief", "log_likelihood"), None), data.get("diverged", None)
+        step = [data.get(("next", "reward")).squeeze(-1), one, mask.shape[-1] * one, mask.sum(-1)]
+        step.append(one * torch.nan if nats is None else nats.reshape(-1))
+        step.append(0 * one if diverged is None else diverged.squeeze(-1))
+        for total, value in zip(sums, step, strict=True):
+            total[rows] += running * value
 
-    if not run_episodes(
-        policy, make_env, episodes=episodes, mode=mode, seed=seed, watch=add, stop=stop
-    ):
+    how: Any = {"episodes": episodes, "mode": mode, "seed": seed}
+    if not run_episodes(policy, make_env, **how, watch=add, stop=stop):
         return None
-    return Episodes(
-        returns.tolist(),
-        lengths.tolist(),
-        (1 - observed / entries.double()).tolist(),
-        (likelihoods / observed.clamp_min(1)).tolist() if has_model else None,
-        diverged.tolist(),
+    table = pd.DataFrame(dict(zip(names, sums.numpy(), strict=True)))
+    diverged = table.diverged > 0
+    likelihood = table.nats / table.arrived.clip(lower=1)
+    return table[["return"]].assign(
+        length=table.length.astype(int),
+        missing_ratio=1 - table.arrived / table.entries,
+        log_likelihood=likelihood.where(~diverged),
+        diverged=diverged.astype(int),
+    )
+
+
+def over_episodes(episodes: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """Sum up rows of :func:`evaluate` by some of their columns.
+
+    Missing ratio and log-likelihood are over all steps and entries; the latter is 0 where nothing
+    arrived, and NaN where a belief diverged.
+    """
+    arrived = episodes.length * (1 - episodes.missing_ratio)
+    nats = arrived * episodes.get("log_likelihood", np.nan)
+    table = episodes.assign(
+        arrived=arrived, nats=nats, diverged=episodes.get("diverged", 0.0)
+    ).groupby(list(by), sort=False, as_index=False)
+    rows = table.agg(
+        episodes=("return", "size"),
+        return_mean=("return", "mean"),
+        return_std=("return", "std"),
+        length_mean=("length", "mean"),
+        steps=("length", "sum"),
+        arrived=("arrived", "sum"),
+        nats=("nats", lambda values: values.sum(skipna=False)),
+        diverged=("diverged", "mean"),
+    )
+    return rows.assign(
+        missing_ratio=1 - rows.arrived / rows.steps,
+        # The weights are counts over the number of components: one entry of many is below 1.
+        log_likelihood=rows.nats / rows.arrived.clip(lower=1e-12),
     )
 
 

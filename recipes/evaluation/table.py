@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -28,7 +28,6 @@ _COLUMNS = {*_KEY, "env", "method", "training_seed", "frames", "seed", "reductio
 _AGAIN = "name another `output`, or overwrite=true begins anew."
 
 Task = tuple[Path, Condition, Sequence[str]]  # run folder, condition, kinds of action
-Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -86,9 +85,9 @@ class Table:
         rows = self.rows[(self.rows["run"] == run) & (self.rows["point"] == condition.name)]
         return [mode for mode in modes if mode not in set(rows["mode"])]
 
-    def add(self, rows: Rows) -> None:
+    def add(self, rows: pd.DataFrame) -> None:
         """Enter the episodes of a condition and write the table."""
-        new = pd.DataFrame(rows).astype(object).map(lambda v: "" if pd.isna(v) else str(v))
+        new = rows.map(lambda v: "" if pd.isna(v) else str(v))
         self.rows = pd.concat([self.rows, new], ignore_index=True) if len(self.rows) else new
         self.write()
 
@@ -121,40 +120,25 @@ def evaluate_condition(
     protocol: Protocol,
     *,
     run: str = "",
-) -> Rows:
+) -> pd.DataFrame:
     """Evaluate an agent under a condition: one row an episode and kind of action (``modes``)."""
-    episodes, policy = protocol.episodes, StoppingPolicy(trained.agent)
     removed = removed_sensors(
-        condition, trained, episodes=episodes, reduction_seed=protocol.reduction_seed
+        condition, trained, episodes=protocol.episodes, reduction_seed=protocol.reduction_seed
     )
     make_env = trained.environments(condition.missingness, condition.noise, removed)
-    at_random = condition.selection == "random"
-    rows = []
+    policy = StoppingPolicy(trained.agent)
+    how: Any = {"episodes": protocol.episodes, "seed": protocol.seed}
+    drawn = {"reduction_seed": protocol.reduction_seed if condition.selection == "random" else None}
+    tables = []
     for mode in modes:
-        result = evaluate(policy, make_env, episodes=episodes, mode=mode, seed=protocol.seed)
-        assert result is not None
-        likelihoods: Sequence[float | None] = result.log_likelihoods or [None] * episodes
-        rows += [
-            {"run": run}
-            | _identity(trained)
-            | condition.columns()
-            | {
-                "mode": mode,
-                "episode": episode,
-                "return": result.returns[episode],
-                "length": result.lengths[episode],
-                "missing_ratio": result.missing_ratios[episode],
-                "log_likelihood": None if result.diverged[episode] else likelihoods[episode],
-                "diverged": int(result.diverged[episode]),
-                "seed": protocol.seed,
-                "reduction_seed": protocol.reduction_seed if at_random else None,
-            }
-            for episode in range(episodes)
-        ]
-    return rows
+        result = evaluate(policy, make_env, mode=mode, **how)
+        columns = {"run": run} | _identity(trained) | condition.columns()
+        columns |= {"mode": mode, "episode": range(protocol.episodes)} | dict(cast(Any, result))
+        tables.append(pd.DataFrame(columns | {"seed": protocol.seed} | drawn, dtype=object))
+    return pd.concat(tables, ignore_index=True)
 
 
-def _evaluate_task(task: Task, protocol: Protocol) -> tuple[Task, Rows]:
+def _evaluate_task(task: Task, protocol: Protocol) -> tuple[Task, pd.DataFrame]:
     torch.set_num_threads(protocol.threads)
     folder, condition, modes = task
     trained = load_trained_agent(folder, protocol.gate)
@@ -163,7 +147,7 @@ def _evaluate_task(task: Task, protocol: Protocol) -> tuple[Task, Rows]:
 
 def evaluate_tasks(
     tasks: Sequence[Task], protocol: Protocol, processes: int
-) -> Iterator[tuple[Task, Rows]]:
+) -> Iterator[tuple[Task, pd.DataFrame]]:
     """Yield tasks and their rows as they come, several at a time; the numbers are the same."""
     jobs = (delayed(_evaluate_task)(task, protocol) for task in tasks)
     count = max(1, min(processes, len(tasks)))

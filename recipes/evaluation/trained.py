@@ -17,14 +17,13 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from training.agent import Agent, add_primers, load_agent, make_agent
 from training.checkpoint import fitting
-from training.config import missingness_name
 from training.envs import env_name, make_env
 from training.errors import UserError
-from training.methods import method_name
 from training.run_folder import load_config
 from training.sensors import sensor_names
 
 from evaluation.episodes import BLOCK
+from evaluation.points import method_name, missingness_name
 from torchrl_drbpn import BeliefFilterModule, SensorReduction
 
 WEIGHTS = "agent.safetensors"  # of an agent that was saved by itself

@@ -24,9 +24,6 @@ def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]
     """Return the indices of the sensors to draw.
 
     ``wanted`` is how many of those that miss most, or names or numbers of components.
-
-    Raises:
-        UserError: if there is no such sensor.
     """
     names = recording.names
     if isinstance(wanted, int):

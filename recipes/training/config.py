@@ -22,11 +22,14 @@ from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from torchrl_drbpn import BeliefDivergedError
 from training.errors import UserError
 
 CONF = Path(__file__).parents[2] / "conf"
 GROUPINGS = ("sensor", "joint", "kind")
 _USER_ERROR = 2
+# What ends in one line; of a belief where a learned model runs open loop.
+EXPECTED = (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException)
 
 # Least and greatest value of what no constructor checks.
 _LIMITS: dict[str, tuple[float, float]] = {
@@ -99,13 +102,9 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
     """
     groups = [word for word in overrides if (CONF / word.split("=")[0].lstrip("+~")).is_dir()]
     defaults = hydra.compose("config", groups)
-    for key, value in _leaves(config):
+    for key, value in leaves(config):
         _check_type(config, key, value, OmegaConf.select(defaults, key, default=value))
-    for key, (least, most) in _LIMITS.items():
-        value = OmegaConf.select(config, key)
-        if value is not None and not least <= value <= most:
-            wanted = f"at least {least:g}" if most == inf else f"in [{least:g}, {most:g}]"
-            raise UserError(f"`{key}` must be {wanted}, got {value}.")
+    check_limits({key: OmegaConf.select(config, key) for key in _LIMITS}, _LIMITS)
     _check_sizes(config)
     if OmegaConf.select(config, "missingness.always_observed") == 1 and config.missingness.eta > 0:
         raise UserError(
@@ -115,6 +114,18 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
     for mode in config.evaluation.modes:
         check_mode(mode)
     return config
+
+
+def check_limits(
+    values: Mapping[str, Any], limits: Mapping[str, tuple[float, float]], *, whole: bool = False
+) -> None:
+    """Refuse what is no (whole) number in [least, most], by its key; null is not looked at."""
+    for key, (least, most) in limits.items():
+        value = values[key]
+        number = type(value) is int or (type(value) is float and not whole)
+        if value is not None and not (number and least <= value <= most):
+            wanted = f"at least {least:g}" if most == inf else f"in [{least:g}, {most:g}]"
+            raise UserError(f"`{key}` must be {wanted}, got {value!r}.")
 
 
 def _check_sizes(config: DictConfig) -> None:
@@ -154,7 +165,7 @@ def _check_type(config: DictConfig, key: str, value: Any, default: Any) -> None:
         raise UserError(f"`{key}` must be {wanted}, got {value!r}.")
 
 
-def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted name and the value of every entry that holds no others."""
     if isinstance(node, DictConfig):
         for key in node:
@@ -164,7 +175,7 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             name = f"{path}.{key!s}" if path else str(key)
             if missing:
                 raise UserError(f"`{name}` must be given.")
-            yield from _leaves(node[key], name)
+            yield from leaves(node[key], name)
     else:
         yield path, node
 
@@ -173,46 +184,6 @@ def check_mode(mode: str) -> None:
     """Refuse what is not the name of a kind of action, ``sampled`` or ``mean``."""
     if mode not in ("sampled", "mean"):
         raise UserError(f"`modes` must hold sampled and mean, got {mode!r}.")
-
-
-def missingness_kind(node: Mapping[str, Any]) -> str:
-    """Return what makes entries go missing: ``none``, ``mar``, ``outages``, or one's own target."""
-    for kind, key in (("delay", "delay"), ("multi_rate", "period")):
-        if key in node and "group_by" in node:
-            return kind
-    if "mean_length" in node:
-        return "outages"
-    if node.get("eta") == 0:
-        return "none"
-    return str(node.get("mechanism") or node["_target_"].rpartition(".")[2])
-
-
-def missingness_name(node: Mapping[str, Any]) -> str:
-    """Return missingness as a condition that recipes/evaluate.py reads, such as ``mcar:0.5``."""
-    kind = missingness_kind(node)
-    if kind == "outages":
-        return f"outages:{node['eta']:g}:{node['mean_length']:g}:{node['group_by']}"
-    if kind == "delay":
-        least, most = node["delay"], node["max_delay"]
-        drawn = "" if most is None else f":{most}:{node['group_by']}"
-        return f"delay:{least}{drawn}{':in_order' if drawn and node['in_order'] else ''}"
-    if kind == "multi_rate":
-        phase = "" if node["phase"] is None else f":{node['phase']}"
-        return f"multi_rate:{node['period']}:{node['group_by']}{phase}"
-    return f"{kind}:{node['eta']:g}" if "eta" in node else kind
-
-
-def faults_name(node: Mapping[str, Any]) -> str:
-    """Return what is wrong with readings beside white noise, such as `` spikes:0.05:5``."""
-    text = ""
-    if node.get("spike_probability"):
-        text += f" spikes:{node['spike_probability']:g}:{node['spike_std']:g}"
-    if node.get("stuck_probability"):
-        length = node["stuck_mean_length"]
-        text += f" stuck:{node['stuck_probability']:g}:{length:g}:{node['group_by']}"
-    if node.get("drift_std") or node.get("drift_rate"):
-        text += f" drift:{node['drift_std']:g}:{node['drift_rate']:g}"
-    return text
 
 
 # Names of folders -----------------------------------------------------------------------------
@@ -266,18 +237,11 @@ def command(name: str, run: Callable[[dict[str, Any]], int]) -> None:
     run_command(main, name)
 
 
-def expected() -> tuple[type[Exception], ...]:
-    """Return the errors that end in one line; reports, which need none, do without torch."""
-    from torchrl_drbpn import BeliefDivergedError  # where a learned model runs open loop
-
-    return (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException)
-
-
 def explained(job: Callable[[], int | None], name: str = "config") -> int:
     """Run a job; turn what the user can mend into one line on standard error, and status 2."""
     try:
         return job() or 0
-    except expected() as error:
+    except EXPECTED as error:
         line = explain(error, name)
     except OSError as error:  # Hydra makes the run folder
         line = f"`{error.filename}` can't be used: {error.strerror or error}."
@@ -317,7 +281,7 @@ def _names(file: str) -> list[str]:
     """Return every dotted key of a configuration, of the training's every group too."""
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        keys = [key for key, _ in _leaves(hydra.compose(file))]
+        keys = [key for key, _ in leaves(hydra.compose(file))]
     parents = {key[:i] for key in keys for i in range(len(key)) if key[i] == "."}
     groups = [path.name for path in CONF.iterdir() if path.is_dir() and file == "config"]
     return sorted({*keys, *parents, *groups})

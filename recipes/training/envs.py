@@ -50,30 +50,21 @@ def make_env(
         complete: whether to write ``complete_observation``, what complete, noiseless sensors would
             have shown; None: where the critic reads it.
     """
-    own = {} if num_envs is None else {"num_envs": num_envs}
-    base: EnvBase = build("env", config.env, **own)
+    size = {} if num_envs is None else {"num_envs": num_envs}
+    base: EnvBase = build("env", config.env, **size)
     replaced = dict(transforms or {})
     if config.heads.get("critic_input") == "complete" if complete is None else complete:
         replaced["complete"] = RenameTransform(["observation"], [COMPLETE], create_copy=True)
     made: list[Transform] = []
     for name, node in config.transforms.items():
-        nodes = [replaced[name]] if name in replaced else _as_list(node)
-        label = (
-            name if OmegaConf.is_interpolation(config.transforms, name) else f"transforms.{name}"
-        )
-        for part in nodes:
-            if not isinstance(part, Transform):
-                part = build(label, part)
+        own = name if OmegaConf.is_interpolation(config.transforms, name) else f"transforms.{name}"
+        node = replaced.get(name, node)
+        for part in node if isinstance(node, ListConfig) else [] if node is None else [node]:
+            part = part if isinstance(part, Transform) else build(own, part)
             made += part if isinstance(part, list) else [part]
     env = TransformedEnv(base, Compose(*made))
     seed_env(env, config.seed if seed is None else seed)
     return env
-
-
-def _as_list(node: Any) -> list[Any]:
-    if node is None:
-        return []
-    return list(node) if isinstance(node, (list, ListConfig)) else [node]
 
 
 def make_simulators(
@@ -128,40 +119,24 @@ def make_noise(
     if spike_probability != 0:
         made.append(ObservationSpikes(spike_probability, spike_std))
     if stuck_probability != 0:
-        groups = sensor_groups(named_sensors(id, version), group_by)
+        groups = _groups(id, version, group_by)
         made.append(StuckSensors(stuck_probability, stuck_mean_length, groups=groups))
     return made
 
 
-def make_outages(
-    *,
-    eta: float,
-    mean_length: float,
-    group_by: str,
-    id: str,
-    version: str | None,
-    state_key: str | None = None,
-) -> SensorOutages:
+def make_outages(*, group_by: str, id: str, version: str | None, **settings: Any) -> SensorOutages:
     """Make sensors fail for a while, alone or together, see conf/missingness/outages.yaml.
 
     ``state_key`` is where it is kept which of them work; two in one environment need two.
     """
-    groups = sensor_groups(named_sensors(id, version), group_by)
-    return SensorOutages(eta, mean_length, groups=groups, state_key=state_key)
+    return SensorOutages(groups=_groups(id, version, group_by), **settings)
 
 
 def make_delay(
-    *,
-    delay: int,
-    max_delay: int | None,
-    in_order: bool,
-    group_by: str,
-    id: str,
-    version: str | None,
+    *, delay: int, group_by: str, id: str, version: str | None, **settings: Any
 ) -> ObservationDelay:
     """Make readings arrive late, see conf/missingness/delay.yaml."""
-    groups = sensor_groups(named_sensors(id, version), group_by)
-    made = ObservationDelay(delay, max_delay=max_delay, in_order=in_order, groups=groups)
+    made = ObservationDelay(delay, groups=_groups(id, version, group_by), **settings)
     task = gymnasium.registry.get(f"{id}-{version}" if version else id)
     steps = task and task.max_episode_steps
     if steps and delay >= steps:
@@ -176,8 +151,12 @@ def make_multi_rate(
     *, period: int, phase: int | None, group_by: str, id: str, version: str | None
 ) -> ObservationMultiRate:
     """Make sensors deliver now and then, see conf/missingness/multi_rate.yaml."""
-    groups = sensor_groups(named_sensors(id, version), group_by)
+    groups = _groups(id, version, group_by)
     return ObservationMultiRate(period, phase="random" if phase is None else phase, groups=groups)
+
+
+def _groups(id: str, version: str | None, by: str) -> list[list[int]] | None:
+    return sensor_groups(named_sensors(id, version), by)
 
 
 def make_collector(

@@ -33,19 +33,7 @@ def make_loss(
 ) -> LossModule:
     """Build the loss: PPO and, where the belief has a likelihood, that of what arrived.
 
-    Args:
-        agent: whose belief module, actor and critic it trains.
-        clip_epsilon: of the probability ratio.
-        critic_coeff: weight of the value loss.
-        loss_critic_type: ``l1``, ``l2`` or ``smooth_l1``.
-        entropy_coeff: weight of the entropy bonus; 0 leaves it out.
-        normalize_advantage: over each minibatch.
-        model_coeff: weight of minus the log-likelihood.
-        normalize: what the likelihood is divided by, ``entry`` or ``step``.
-        detach_belief: whether PPO's gradient is kept out of the belief module.
-
-    Returns:
-        A loss whose outputs named ``loss*`` are to be summed.
+    See conf/loss/ppo.yaml. Its outputs named ``loss*`` are to be summed.
     """
     ppo = ClipPPOLoss(
         agent.actor,
@@ -78,18 +66,14 @@ def make_loss(
 def add_advantages(
     data: TensorDictBase, agent: Agent, gae: GAE, *, recompute: bool = False
 ) -> None:
-    """Write values and advantages into a rollout.
+    """Write values and advantages into a normalised rollout ``(environments, time)``, in place.
 
     Where an episode goes on, the belief that follows a step is the one stored at the next step, and
     so is its value: only where one ends, or the rollout is cut, is there another one to value.
 
-    Args:
-        data: normalised rollout of batch size ``(environments, time)``; changed in place.
-        agent: whose critic values the beliefs.
-        gae: TorchRL's, of values that are there already.
-        recompute: by the current parameters: every belief is taken one step on from the stored one
-            before it. Exact for a belief without memory; with memory, what lies before that step
-            is as old as the beliefs that the sequences of the update start from.
+    ``recompute`` values by the current parameters: every belief is taken one step on from the
+    stored one before it. Exact for a belief without memory; with memory, what lies before that step
+    is as old as the beliefs that the sequences of the update start from.
     """
     value = agent.one_step_value(data) if recompute else agent.value(data)
     following = data.get("next")
@@ -106,19 +90,12 @@ def add_advantages(
 
 
 def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorDict:
-    """Cut a rollout into sequences and keep what the loss reads.
+    """Cut a rollout with advantages into sequences and keep what the loss reads.
 
     The last step of each environment is marked ``final``: the rollout ends there, so that the
     observation after it is nobody's root step and its likelihood is counted here. Where sequences
-    are cut from each other nothing is marked.
-
-    Args:
-        data: rollout of batch size ``(environments, time)`` with advantages.
-        loss: the loss that reads the sequences.
-        length: time steps of a sequence; divides the rollout.
-
-    Returns:
-        Contiguous tensors, batch size ``(environments * time / length, length)``.
+    are cut from each other nothing is marked. The tensors are contiguous, batch size
+    ``(environments * time / length, length)``.
     """
     final = torch.zeros(*data.shape, 1, dtype=torch.bool)
     final[:, -1] = True
@@ -137,16 +114,7 @@ def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorD
 def minibatches(
     sequences: TensorDict, count: int, generator: torch.Generator
 ) -> Iterator[TensorDictBase]:
-    """Yield the sequences in random order, each once.
-
-    Args:
-        sequences: batch size ``(sequences, time)``.
-        count: minibatches; divides the number of sequences.
-        generator: of the order.
-
-    Yields:
-        Minibatches of batch size ``(sequences / count, time)``.
-    """
+    """Yield the sequences in random order, each once, in so many minibatches."""
     order = torch.randperm(sequences.shape[0], generator=generator)
     # One gather an epoch; the minibatches are views of it.
     yield from sequences[order].split(sequences.shape[0] // count)
@@ -156,18 +124,7 @@ def minibatches(
 
 
 class GradientSteps:
-    """Hold an optimiser and how it steps.
-
-    Args:
-        parameters: what is optimised.
-        optimizer: makes the optimiser of parameters and ``lr``.
-        lr: learning rate of the first rollout; it falls linearly.
-        max_grad_norm: of all parameters together.
-        epochs: passes over a rollout.
-        minibatches: per epoch.
-        sequence_length: time steps of a sequence; 1 where the belief has no memory.
-        recompute_advantages: whether anew, by the current parameters, before every later epoch.
-    """
+    """Hold an optimiser and how it steps, see conf/optim/adam.yaml."""
 
     def __init__(
         self,
@@ -188,11 +145,7 @@ class GradientSteps:
         self.recompute_advantages = recompute_advantages
 
     def take(self, loss: torch.Tensor) -> torch.Tensor:
-        """Take one step down a loss.
-
-        Raises:
-            DivergedError: if it is no finite number.
-        """
+        """Take one step down a loss, which must be a finite number; return the gradient's norm."""
         self.optimizer.zero_grad()
         torch.autograd.backward(loss)
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
@@ -204,12 +157,7 @@ class GradientSteps:
 class PPO:
     """Take epochs of minibatch steps on one loss over belief, policy and value.
 
-    Args:
-        agent: whose parameters are changed.
-        loss: its outputs named ``loss*`` are summed.
-        steps: on it.
-        gae: estimator of advantages, where they are recomputed.
-        seed: of the order of minibatches.
+    ``gae`` recomputes advantages where that is asked for; ``seed`` orders the minibatches.
     """
 
     def __init__(
@@ -222,17 +170,11 @@ class PPO:
         self.generator = torch.Generator().manual_seed(seed)
 
     def update(self, data: TensorDictBase, remaining: float) -> dict[str, float]:
-        """Take the gradient steps of one rollout.
+        """Take the gradient steps of one rollout ``(environments, time)`` with advantages.
 
-        Args:
-            data: rollout of batch size ``(environments, time)`` with advantages.
-            remaining: share of the run still to come; the learning rate falls with it.
-
-        Returns:
-            The means of what the loss reports, and the learning rate.
-
-        Raises:
-            DivergedError: if a loss, a gradient or a weight is no finite number.
+        The learning rate falls with ``remaining``, the share of the run still to come. Returns the
+        means of what the loss reports, and the learning rate. A loss, gradient or weight that is no
+        finite number ends the run.
         """
         lr = self.steps.lr * remaining
         for group in self.steps.optimizer.param_groups:
@@ -248,14 +190,7 @@ class PPO:
         return {**row, "lr": lr}
 
     def cut(self, data: TensorDictBase) -> Iterator[TensorDict]:
-        """Yield the sequences of each epoch; advantages are recomputed in place.
-
-        Args:
-            data: rollout of batch size ``(environments, time)`` with advantages.
-
-        Yields:
-            Sequences, batch size ``(environments * time / length, length)``.
-        """
+        """Yield the sequences of each epoch; advantages are recomputed in place."""
         sequences = to_sequences(data, self.loss, self.sequence_length)
         for epoch in range(self.steps.epochs):
             if epoch and self.steps.recompute_advantages:
@@ -265,11 +200,7 @@ class PPO:
             yield sequences
 
     def step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
-        """Take one gradient step.
-
-        Returns:
-            What the loss reports, and ``grad_norm``.
-        """
+        """Take one gradient step; return what the loss reports, and ``grad_norm``."""
         terms = dict(self.loss(minibatch).items())
         losses = {key: value for key, value in terms.items() if key.startswith("loss")}
         check_finite(losses, "loss")
@@ -290,11 +221,7 @@ class PPO:
 
 
 def check_finite(tensors: Mapping[str, torch.Tensor], kind: str) -> None:
-    """Check that tensors hold finite numbers alone.
-
-    Raises:
-        DivergedError: naming the first that does not.
-    """
+    """Raise for the first of the tensors that holds a number that is not finite."""
     if torch.stack([value.detach().sum() for value in tensors.values()]).sum().isfinite():
         return
     for name, value in tensors.items():
@@ -307,15 +234,11 @@ def check_finite(tensors: Mapping[str, torch.Tensor], kind: str) -> None:
 
 
 def rollout_metrics(data: TensorDictBase) -> dict[str, float | None]:
-    """Return what a rollout says of the sensors, the belief and the value.
+    """Return what a rollout with advantages says of the sensors, the belief and the value.
 
-    Args:
-        data: rollout with advantages.
-
-    Returns:
-        ``missing_ratio``, over all components; ``log_likelihood``, nats per observed entry of
-        normalised observation, None without a model; ``explained_variance`` of the returns by the
-        values, 0 where they do not vary; ``action_std``.
+    ``missing_ratio`` is over all components; ``log_likelihood`` nats per observed entry of
+    normalised observation, None without a model; ``explained_variance`` that of the returns by the
+    values, 0 where they do not vary.
     """
     observed, target = data.get("observed"), data.get("value_target")
     likelihood = data.get(("belief", "log_likelihood"), None)
@@ -334,12 +257,7 @@ def rollout_metrics(data: TensorDictBase) -> dict[str, float | None]:
 def finished_episodes(data: TensorDictBase, frames: int) -> list[dict[str, Any]]:
     """Return the episodes that ended in a rollout, in the order of time.
 
-    Args:
-        data: rollout of batch size ``(environments, time)``.
-        frames: environment steps at its end.
-
-    Returns:
-        ``frames``, ``return`` (raw) and ``length`` of each.
+    ``frames`` are the environment steps at its end; ``return`` is raw.
     """
     # Time first, so that the order does not depend on the environment's place in the batch.
     done, returns, lengths = (

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -21,9 +21,6 @@ from yaml import YAMLError
 
 from training.config import build
 from training.errors import UserError
-
-if TYPE_CHECKING:  # reports read run folders without loading torch
-    from torchrl.record.loggers.common import Logger
 
 _PACKAGES = (
     *("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "envpool", "numpy", "hydra-core"),
@@ -52,15 +49,11 @@ def write_whole(path: Path, text: str) -> None:
     os.replace(temporary, path)
 
 
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV file whole or not at all; all rows have the same keys."""
-    write_whole(path, _csv_text(list(rows[0]), rows))
-
-
-def _csv_text(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
+def _csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, head: bool) -> str:
     file = io.StringIO()
-    writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writeheader()
+    writer = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
+    if head:
+        writer.writeheader()
     writer.writerows(rows)
     return file.getvalue()
 
@@ -73,50 +66,34 @@ class Table:
     """
 
     def __init__(self, path: Path, columns: Sequence[str], up_to_frames: int | None = None) -> None:
-        self.path, self.columns = path, list(columns)
-        kept: list[dict[str, str]] = []
+        self.path, self.columns, kept = path, list(columns), []
         if up_to_frames is not None and path.exists():
             try:
-                with path.open(newline="", encoding="utf-8") as file:
-                    kept = list(self._whole_rows(csv.DictReader(file), up_to_frames))
-            except (OSError, UnicodeDecodeError, csv.Error) as error:
-                raise UserError(f"`{path}` can't be read as a table: is it damaged?") from error
-        write_whole(path, _csv_text(self.columns, kept))
-
-    def _whole_rows(self, rows: csv.DictReader[str], frames: int) -> Iterator[dict[str, str]]:
-        if "frames" not in (rows.fieldnames or ()):
-            raise UserError(f"`{self.path}` must begin with the names of its columns: damaged?")
-        for row in rows:
-            try:
                 # A row that was being written when the machine stopped has no end.
-                whole = None not in row.values() and int(row["frames"]) <= frames
-            except ValueError:
-                whole = False
-            if whole:
-                yield {c: row.get(c, "") for c in self.columns}
+                lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+                rows = csv.DictReader(line for line in lines if line.endswith("\n"))
+                if "frames" not in (rows.fieldnames or ()):
+                    raise ValueError("no names of columns")
+                kept = [row for row in rows if int(row["frames"]) <= up_to_frames]
+            except (OSError, ValueError, csv.Error) as error:
+                raise UserError(f"`{path}` can't be read as a table: is it damaged?") from error
+        write_whole(path, _csv_text(self.columns, kept, head=True))
 
-    def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def append(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Append rows; an absent value or None is an empty cell, others are left out."""
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self.columns, lineterminator="\n")
-            writer.writerows({c: row.get(c) for c in self.columns} for row in rows)
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(_csv_text(self.columns, rows, head=False))
 
 
 def is_evaluated(folder: Path, config: DictConfig) -> bool:
     """Return whether a run has its final evaluation, as its configuration asks for it."""
-    wanted = config.evaluation
-    path = folder / "evaluation.csv"
+    wanted, path = config.evaluation, folder / "evaluation.csv"
     if not wanted.final_episodes:
         return True
-    if not path.is_file():
-        return False
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        done = {
-            row.get("mode")
-            for row in csv.DictReader(file)
-            if row.get("kind") == "final" and row.get("episodes") == str(wanted.final_episodes)
-        }
-    return set(wanted.modes) <= done
+    lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
+    final = ("final", str(wanted.final_episodes))
+    rows = [row for row in csv.DictReader(lines) if (row["kind"], row["episodes"]) == final]
+    return {*wanted.modes} <= {row["mode"] for row in rows}
 
 
 def load_config(folder: Path) -> DictConfig:
@@ -194,18 +171,11 @@ def write_versions(folder: Path) -> None:
 
 def _git(*arguments: str) -> str:
     """Return what git says about this checkout, or nothing."""
+    command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent), *arguments]
     try:
-        answer = subprocess.run(
-            ["git", "--no-optional-locks", *arguments],  # it only reads
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=10,
-        )
+        return subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True).strip()
     except (OSError, subprocess.SubprocessError):
         return ""
-    return answer.stdout.strip()
 
 
 @contextmanager
@@ -254,7 +224,7 @@ class RunLog:
         frames: int | None,
         evaluated_frames: int | None,
     ) -> None:
-        self.logger: Logger = build("logger", config.logger, logger_name=str(folder))
+        self.logger = build("logger", config.logger, logger_name=str(folder))
         self.metrics = Table(folder / "metrics.csv", metric_columns(columns), frames)
         self.episodes = Table(folder / "episodes.csv", ("frames", "return", "length"), frames)
         # Evaluations that the checkpoint does not know of are made again, the final one included.

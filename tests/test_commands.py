@@ -1,0 +1,107 @@
+"""What the commands of the recipes can not do is said in one line, before anything is done."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
+from evaluation_tools import configured  # isort: skip
+
+from training.config import command
+from training.errors import UserError
+
+NO_RUN = "`run` must name "
+COMMANDS = ("evaluate", "diagnose", "play", "plot_sensors", "report", "save_agent")
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "line"),
+    [
+        ("evaluate", {"run": None}, NO_RUN),
+        ("evaluate", {"episodes": 0}, "`episodes` must be at least 1, got 0"),
+        ("evaluate", {"processes": 1.5}, "`processes` must be at least 1, got 1.5"),
+        ("evaluate", {"modes": ["best"]}, "`modes` must hold sampled and mean"),
+        ("evaluate", {"modes": []}, "`modes` must hold sampled, mean or both"),
+        ("evaluate", {"output": "no/such/folder/x.csv"}, "`output` must lie in an existing folder"),
+        ("evaluate", {"points": ["reduction:0.5:random"], "reduction_seed": -1},
+         "`reduction_seed` must be"),
+        ("evaluate", {"gate": 0}, "`gate` must be a positive, finite number"),
+        ("evaluate", {"gate": "wide"}, "`gate` must be a positive, finite number"),
+        ("diagnose", {"run": None}, NO_RUN),
+        ("diagnose", {"redraw": "nowhere"}, "nowhere has no tables"),
+        ("diagnose", {"points": []}, "`points` must hold at least one"),
+        ("diagnose", {"mode": "best"}, "`modes` must hold"),
+        ("diagnose", {"episodes": 0}, "`episodes` must be at least 1, got 0"),
+        ("diagnose", {"bins": [1, 3, 3]}, "`bins` must be whole numbers that start at 1 and asc"),
+        ("diagnose", {"resamples": 1}, "`resamples` must be at least 2"),
+        ("diagnose", {"out": __file__}, "`out` must be a folder, .* is a file"),
+        ("play", {"run": None}, NO_RUN),
+        ("play", {"point": "mcar:2"}, "`points` must hold"),
+        ("play", {"mode": "best"}, "`modes` must hold"),
+        ("play", {"steps": 0}, "`steps` must be at least 1, got 0"),
+        ("play", {"start": -1}, "`start` must be at least 0, got -1"),
+        ("play", {"start": 100_000}, "`start` must lie inside the episode"),
+        ("play", {"fps": 60}, r"`fps` must be in \[1, 50\], got 60"),
+        ("play", {"sensors": ["pole"]}, "`sensors` must be among 0 cart position, .*got 'pole'"),
+        ("play", {"sensors": [4]}, "`sensors` must be among .*got 4"),
+        ("play", {"sensors": 0}, "`sensors` must be 1 or more"),
+        ("play", {"out": "nowhere/film.gif"}, "`out` must lie in an existing folder"),
+        ("play", {"out": "film.avi"}, r"`out` must end in .gif, .mp4 or .png, got film.avi"),
+        ("plot_sensors", {"run": None}, NO_RUN),
+        ("plot_sensors", {"run": "nowhere/*"}, "run folders, nowhere/\\* matches none"),
+        ("plot_sensors", {"run": "nowhere"}, "there is no folder nowhere"),
+        ("plot_sensors", {"orders": 5}, "`orders` must be at least 20"),
+        ("plot_sensors", {"dpi": 0}, "`dpi` must be at least 1"),
+        ("report", {"run": "nowhere"}, "`run` must name run folders, there is no folder nowhere"),
+        ("report", {"run": None}, NO_RUN),
+        ("report", {"out": None}, "`out` must be the folder of a study"),
+        ("report", {"from": "nowhere"}, "`from` reads and writes the tables of a study: leave out"),
+        ("report", {"from": "nowhere", "run": None, "out": None}, "`from` must name folders with"),
+        ("report", {"rows": 1}, "`rows` must be at least 2, got 1"),
+        ("save_agent", {"run": None}, "`run` must name a folder"),
+        ("save_agent", {"out": None}, "`out` must name a folder"),
+        ("save_agent", {}, "has no final evaluation yet"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_answered_with_one_line_before_anything_is_done(
+    drbpn: Path, tmp_path: Path, name: str, changes: dict[str, Any], line: str
+) -> None:
+    config = configured(name) | {"run": str(drbpn)} | changes
+    if "out" not in changes:
+        config["out"] = str(tmp_path / ("film.gif" if name == "play" else "out"))
+    if name == "evaluate" and "output" not in changes:
+        config |= {"output": str(tmp_path / "out.csv"), "processes": changes.get("processes", 1)}
+    with pytest.raises(UserError, match=line) as caught:
+        importlib.import_module(name).run(config)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["diagnose", "plot_sensors"])
+def test_several_runs_need_a_folder(drbpn: Path, feedforward: Path, name: str) -> None:
+    with pytest.raises(UserError, match="`out` must name a folder for 2 runs"):
+        importlib.import_module(name).run(
+            configured(name) | {"run": [str(drbpn), str(feedforward)]}
+        )
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_line_goes_to_standard_error_with_status_2(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["run=nowhere", f"out={tmp_path}"], ["runs=x"]):
+        if name == "evaluate":
+            words = words[:1]
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # the command sets it: undone after the test
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
+        with pytest.raises(SystemExit) as left:
+            command(name, importlib.import_module(name).run)
+        (line,) = capsys.readouterr().err.splitlines()
+        assert left.value.code == 2
+        assert line.startswith(("error: `run", "error: `nowhere"))
