@@ -32,6 +32,7 @@ from recipe_tools import (  # isort: skip
     assembled,
     command,
     differences,
+    make_config,
     read_table,
     resume,
     run,
