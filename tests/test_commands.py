@@ -72,7 +72,7 @@ COMMANDS = ("evaluate", "diagnose", "play", "plot_sensors", "report", "save_agen
 def test_bad_input_is_answered_with_one_line_before_anything_is_done(
     drbpn: Path, tmp_path: Path, name: str, changes: dict[str, Any], line: str
 ) -> None:
-    config = configured(name) | {"run": str(drbpn)} | changes
+    config = configured(name) | {"run": str(drbpn), "start": 0} | changes
     if "out" not in changes:
         config["out"] = str(tmp_path / ("film.gif" if name == "play" else "out"))
     if name == "evaluate" and "output" not in changes:
