@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import DoubleToFloat, EnvBase, GymEnv, ParallelEnv, TransformedEnv
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, ParallelEnv, TransformedEnv
 
 OBS, ACTION = 5, 2
 
@@ -81,3 +81,13 @@ def saved(state: Any) -> Any:
     torch.save(state, buffer)
     buffer.seek(0)
     return torch.load(buffer, weights_only=True)
+
+
+def staircase(*transforms: Any, **kwargs: Any) -> TransformedEnv:
+    """Return a staircase with transforms."""
+    return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
+
+
+def vectors(value: float = 1.0, batch: tuple[int, ...] = (4,), **more: Any) -> TensorDict:
+    """Return observations of one value, as a step would give them."""
+    return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)

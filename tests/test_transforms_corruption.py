@@ -7,7 +7,8 @@ from functools import partial
 
 import pytest
 import torch
-from contracts import ACTION, OBS, StaircaseEnv
+from contracts import ACTION, OBS, StaircaseEnv, staircase
+from contracts import vectors as data
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
@@ -26,14 +27,6 @@ MISSING = partial(ObservationMissingness, "mcar", 0.5)
 MAR = partial(ObservationMissingness, "mar", 0.5)
 NOISE = partial(ObservationNoise, 0.1)
 SPIKES = partial(ObservationSpikes, 0.1, 5.0)
-
-
-def staircase(*transforms, **kwargs):
-    return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
-
-
-def data(value=1.0, batch=(4,), **more):
-    return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
 def test_specs_say_what_is_written():

@@ -6,10 +6,10 @@ import math
 
 import pytest
 import torch
-from contracts import ACTION, OBS, StaircaseEnv
+from contracts import ACTION, OBS, staircase
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, StepCounter, TransformedEnv
+from torchrl.envs import StepCounter
 
 from torchrl_drbpn.transforms import (
     ObservationDelay,
@@ -22,10 +22,6 @@ from torchrl_drbpn.transforms import (
 
 COMPLETE = "complete_observation"
 GROUPS = [[0, 3], [-1]]
-
-
-def staircase(*transforms, **kwargs):
-    return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
 
 
 def collected(*transforms, steps=40, batch=3, horizon=7):

@@ -7,22 +7,14 @@ import math
 
 import pytest
 import torch
-from contracts import OBS, StaircaseEnv
+from contracts import OBS, staircase
+from contracts import vectors as data
 from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
 
 from torchrl_drbpn.functional.missingness import outage_rates, sample_working
 from torchrl_drbpn.transforms import SensorOutages
 
 GROUPS = [[0, 3], [1, -1]]
-
-
-def staircase(*transforms, **kwargs):
-    return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
-
-
-def data(value=1.0, batch=(4,), **more):
-    return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
 def test_masks_follow_the_chain_and_every_episode_has_its_own_start():

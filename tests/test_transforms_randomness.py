@@ -10,7 +10,8 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from contracts import ACTION, OBS, StaircaseEnv, gym_env, saved
+from contracts import ACTION, OBS, gym_env, saved, staircase
+from contracts import vectors as data
 from tensordict import TensorDict
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 
@@ -29,14 +30,6 @@ from torchrl_drbpn.transforms import (
 
 COMPLETE = "complete_observation"
 KINDS = ["mcar", "mar", "nmar"]
-
-
-def staircase(*transforms, **kwargs):
-    return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
-
-
-def data(value=1.0, batch=(4,), **more):
-    return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
 def corrupted_gym(**kwargs):
