@@ -9,27 +9,11 @@ from __future__ import annotations
 import pytest
 import torch
 from filter_problems import FORMS, SIZES, Problem
-from kalman_cases import SEEDS, given
+from kalman_cases import SEEDS
 from torch import Tensor
 
 from torchrl_drbpn import functional as F
 from torchrl_drbpn.functional import Belief, filter_step
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_float32_is_near_float64(state, obs, form):
-    double = Problem(state, obs, stored=True)
-    single = Problem(state, obs, stored=True, dtype=torch.float32)
-    outputs, truth = single.library(form), double.library(form)
-    for a, e in zip(outputs, truth, strict=True):
-        assert a.dtype == torch.float32
-        torch.testing.assert_close(a.double(), e, atol=1e-4, rtol=1e-4)
-    gradients, true_gradients = single.gradients(outputs), double.gradients(truth)
-    for name, gradient in gradients.items():
-        scale = max(1.0, float(true_gradients[name].abs().max()))
-        assert gradient.dtype == torch.float32
-        assert float((gradient.double() - true_gradients[name]).abs().max()) < 1e-4 * scale, name
 
 
 def at_the_noise_floor(
@@ -220,16 +204,3 @@ def test_a_float32_covariance_is_not_inflated(std):
         cov = F.update(Belief(zeros, std**2 * eye), zeros, seen, h.to(dtype), r).cov
         variances.append(cov.diagonal().double())
     torch.testing.assert_close(*variances, rtol=1e-5, atol=0)
-
-
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_a_float32_step_is_near_float64(state, obs):
-    (belief, x, observed, *model), _ = given(state, obs)
-    single = Belief(*(t.float() for t in belief))
-    narrow = (single, x.float(), observed, *(t.float() for t in model))
-    truth = (belief, x, observed, *model)
-    for a, b in zip(F.update(*narrow), F.update(*truth), strict=True):
-        assert a.dtype == torch.float32
-        torch.testing.assert_close(a.double(), b, atol=2e-5, rtol=2e-5)
-    ll = F.log_likelihood(*narrow).double()
-    torch.testing.assert_close(ll, F.log_likelihood(*truth), atol=2e-4, rtol=2e-5)

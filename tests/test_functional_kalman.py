@@ -1,16 +1,10 @@
 """One Kalman step under missing entries: the laws of `functional.kalman`, in float64.
 
-- Masking an entry equals deleting its row, in values and in gradients; nothing observed returns the
-  predicted belief and a log-likelihood of 0, exactly; what lies under a False mask changes nothing.
-- The log-likelihood is that of `MultivariateNormal`; an unbounded noise is a missing entry.
-- The order of the entries, the order of assimilation and the batch shape do not matter.
-- An update never raises the trace of the covariance, and no eigenvalue of it.
-- Steps agree with steps by hand, one joint Gaussian, statsmodels and the golden ratio.
+Laws over masks, shapes and dimensions drawn at random are in test_functional_properties.py.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import oracles
@@ -78,21 +72,6 @@ def test_nothing_observed_returns_the_predicted_belief_and_likelihood_zero(state
     assert torch.allclose(cov.grad + cov.grad.mT, 2 * torch.ones_like(cov))
 
 
-@pytest.mark.parametrize("junk", [math.nan, math.inf, -math.inf, 1e30])
-@sized
-def test_what_lies_under_a_false_mask_changes_nothing_and_has_zero_gradient(state, obs, junk):
-    (belief, clean, observed, *model), _ = given(state, obs)
-    results = []
-    for x in (clean, torch.where(observed, clean, junk)):
-        leaves = [t.clone().requires_grad_() for t in (x, *belief, *model)]
-        x, mean, cov, *rest = leaves
-        out = outputs(Belief(mean, cov), x, observed, *rest)
-        results.append((*out, *torch.autograd.grad(sum(t.square().sum() for t in out), leaves)))
-    for a, b in zip(*results, strict=True):
-        assert torch.equal(a, b)
-    assert torch.equal(results[1][5] != 0, observed)  # the gradient by x
-
-
 @sized
 def test_an_unbounded_noise_variance_is_a_missing_entry(state, obs):
     (belief, x, observed, h, r, offset), _ = given(state, obs, full_noise=False)
@@ -141,59 +120,6 @@ def test_innovation_is_the_residual_with_zeros_and_the_unmasked_covariance(state
         assert_equal(a, b)
 
 
-@seeded
-@sized
-def test_the_order_of_the_entries_and_the_basis_of_the_state_do_not_matter(state, obs, seed):
-    (belief, x, observed, h, r, offset), g = given(state, obs, seed=seed)
-    residual, innovation_cov, mean, cov, ll = outputs(belief, x, observed, h, r, offset)
-    order = torch.randperm(obs, generator=g)
-    turn = torch.linalg.qr(torch.randn(state, state, generator=g, dtype=torch.float64))[0]
-    turned = Belief(belief.mean @ turn.T, turn @ belief.cov @ turn.T)
-    rows = x[:, order], observed[:, order], (h @ turn.T)[order], r[order][:, order]
-    found = outputs(turned, *rows, offset[:, order])
-    expected = (
-        residual[:, order], innovation_cov[:, order][:, :, order],
-        mean @ turn.T, turn @ cov @ turn.T, ll,
-    )  # fmt: skip
-    for a, b in zip(found, expected, strict=True):
-        assert_equal(a, b)
-
-
-@seeded
-@sized
-def test_assimilating_entries_one_by_one_equals_all_at_once(state, obs, seed):
-    # Holds because the noise is diagonal: the entries are independent given the state.
-    (belief, x, observed, *model), g = given(state, obs, seed=seed, full_noise=False)
-    *_, mean, cov, ll = outputs(belief, x, observed, *model)
-    total = torch.zeros(len(x), dtype=torch.float64)
-    for i in torch.randperm(obs, generator=g).tolist():
-        step = (belief, x, observed & (torch.arange(obs) == i), *model)
-        total, belief = total + F.log_likelihood(*step), F.update(*step)
-    for a, b in zip((*belief, total), (mean, cov, ll), strict=True):
-        assert_equal(a, b)
-
-
-@pytest.mark.parametrize("shape", [(), (1,), (7,), (2, 3), (2, 1, 3)], ids=str)
-def test_a_batch_equals_a_loop_over_its_members(shape):
-    system = oracles.random_system(3, 4, seed=5, full_noise=True)
-    g = torch.Generator().manual_seed(5)
-    randn = lambda *s: torch.randn(*shape, *s, generator=g, dtype=torch.float64)  # noqa: E731
-    mean, action, root, x, offset = randn(3), randn(2), randn(3, 3), randn(4), randn(4)
-    cov = root @ root.mT + torch.eye(3, dtype=torch.float64)
-    observed = torch.rand(*shape, 4, generator=g) < 0.5
-    moves = (system.transition, system.transition_cov)
-    predicted = F.predict(Belief(mean, cov), *moves, action, jacobian=system.dynamics)
-    found = outputs(predicted, x, observed, system.matrix, system.noise, offset)
-    assert [t.shape[len(shape) :] for t in found] == [(4,), (4, 4), (3,), (3, 3), ()]
-    for index in itertools.product(*map(range, shape)):
-        one = mean[index], cov[index]
-        belief = oracles.predict(*one, *moves, action[index], system.dynamics)
-        step = (*belief, x[index], observed[index], system.matrix, system.noise, offset[index])
-        expected = (*belief, *oracles.update(*step), oracles.log_likelihood(*step))
-        for a, e in zip((*predicted, *found[2:]), expected, strict=True):
-            assert_equal(a[index], e)
-
-
 @pytest.mark.parametrize("kind", PATTERNS)
 def test_gradients_agree_with_finite_differences(kind):
     system, belief, x, offset, g = case(2, 3, batch=1)
@@ -207,20 +133,6 @@ def test_gradients_agree_with_finite_differences(kind):
     roots = torch.linalg.cholesky(belief.cov), torch.linalg.cholesky(system.noise)
     leaves = (belief.mean, roots[0], x, system.matrix, roots[1], offset)
     assert torch.autograd.gradcheck(step, [t.clone().requires_grad_() for t in leaves])
-
-
-@seeded
-@sized
-def test_an_update_never_raises_the_trace_nor_any_eigenvalue(state, obs, seed):
-    (belief, x, observed, *model), g = given(state, obs, seed=seed, batch=40)
-    cov = F.update(belief, x, observed, *model).cov
-    # P - filtered cov is positive semidefinite (the Loewner order), of rank the number observed.
-    shrinkage = torch.linalg.eigvalsh(belief.cov - cov)
-    assert shrinkage.min() > -1e-12
-    assert torch.equal((shrinkage > 1e-9).sum(-1), observed.sum(-1).clamp(max=state))
-    less = observed & (torch.rand(observed.shape, generator=g) < 0.5)
-    wider = F.update(belief, x, less, *model).cov
-    assert torch.linalg.eigvalsh(wider - cov).min() > -1e-12
 
 
 def test_two_steps_by_hand():
