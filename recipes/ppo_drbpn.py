@@ -106,14 +106,14 @@ def train_rollout(
     """Collect one rollout and learn from it; return its numbers, and a row a finished episode."""
     if training.frames == 0:
         # First statistics, from a rollout that is not trained on.
-        training.agent.norm.update(collect(training))
+        training.agent.after_rollout(collect(training))
         training.start_episodes()
     remaining = max(0.0, 1 - training.frames / config.total_frames)
     data = collect(training)
     add_advantages(data, training.agent, training.gae)
     metrics = rollout_metrics(data)
     update = training.algorithm.update(data, remaining)
-    training.agent.norm.update(data)
+    training.agent.after_rollout(data)
     training.frames += data.numel()
     finished = finished_episodes(data, training.frames)
     training.episodes += len(finished)

@@ -60,6 +60,7 @@ class Problem:
         residual: bool = True,
         activation: str = "tanh",
         dtype: torch.dtype = torch.float64,
+        propagated: bool = False,
     ) -> None:
         system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
         data = oracles.simulate(system, batch, time, seed=seed, reset_rate=0.3 if resets else 0.0)
@@ -88,6 +89,14 @@ class Problem:
             # With and without a reset beside it.
             self.use_stored[0, 2] = self.use_stored[-1, 1] = True
             leaves["stored_mean"] = torch.randn(batch, time, state, generator=g).double()
+        self.jacobian = self.start_cov = self.stored_cov = None
+        if propagated:
+            # Constants of autograd; it expands in some directions.
+            self.jacobian = 1.1 * system.dynamics.to(dtype)
+            covs = [oracles.spd(state, g) for _ in range(batch * (1 + time))]
+            covs = torch.stack(covs).to(dtype)
+            self.start_cov = covs[:batch]
+            self.stored_cov = covs[batch:].unflatten(0, (batch, time)) if stored else None
         widths = [state + system.action_dim, *hidden, state]
         for i, (fan_in, fan_out) in enumerate(itertools.pairwise(widths)):
             weight = torch.randn(fan_out, fan_in, generator=g).double()
@@ -118,6 +127,7 @@ class Problem:
             emission_offset=self.leaves["bias"],
             initial_mean=self.leaves["initial_mean"],
             initial_cov=p,
+            transition_jacobian=self.jacobian,
         )
 
     def arguments(self) -> tuple[Tensor, ...]:
@@ -125,13 +135,16 @@ class Problem:
         return (*named, self.observed, self.reset)
 
     def stored(self) -> dict[str, Any]:
-        return {"use_stored_state": self.use_stored, "stored_mean": self.leaves.get("stored_mean")}
+        names = {"stored_mean": self.leaves.get("stored_mean"), "stored_cov": self.stored_cov}
+        return {"use_stored_state": self.use_stored, **names}
 
     def run(
         self, form: str, *arguments: Tensor, function: Any = filter_sequence, **kwargs: Any
     ) -> FilterOutput:
         """Filter by one form; "step by step" is what a Q that depends on the state takes."""
         by_step = form == "step by step"
+        if self.jacobian is not None:
+            kwargs = {"cov": self.start_cov, **kwargs}
         return function(
             self.model(by_step),
             *(arguments or self.arguments()),
@@ -151,6 +164,8 @@ class Problem:
             previous_action=self.leaves["previous_action"],
             reset=self.reset,
             start_mean=self.leaves["start_mean"],
+            start_cov=self.start_cov,
+            jacobian=self.jacobian,
             initial_mean=self.leaves["initial_mean"],
             initial_cov=p,
             transition=oracles.mean_network(weights, biases, self.residual, self.activation),

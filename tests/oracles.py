@@ -108,9 +108,10 @@ def filter_sequence(
     noise: Tensor,
     action_matrix: Tensor | None = None,
     bias: Tensor | None = None,
-    jacobian: Tensor | None = None,
+    jacobian: Tensor | Transition | None = None,
     use_stored_state: Tensor | None = None,
     stored_mean: Tensor | None = None,
+    stored_cov: Tensor | None = None,
 ) -> Sequence:
     """Filter [batch, time] data one row and one step at a time.
 
@@ -118,7 +119,9 @@ def filter_sequence(
     `reset` (b, t) the predicted belief is the initial one. At a step with
     `use_stored_state` (b, t) the belief before the step is not the one just computed but
     `stored_mean` (b, t, s).
-    Where both hold, the reset wins. `transition_cov` is a matrix or a function of (mean, action).
+    Where both hold, the reset wins. `transition_cov` is a matrix or a function of (mean, action),
+    so is `jacobian`: with it the covariance is propagated, from `start_cov` (b, s, s) and
+    `stored_cov` (b, t, s, s); what is propagated is a constant of autograd.
     """
     batch, time = observed.shape[:2]
     means, covs, lls = [], [], []
@@ -129,11 +132,13 @@ def filter_sequence(
             action = previous_action[b, t]
             if use_stored_state is not None and stored_mean is not None and use_stored_state[b, t]:
                 mean = stored_mean[b, t]
+                cov = cov if stored_cov is None else stored_cov[b, t]
             if reset[b, t]:
                 mean, cov = initial_mean, initial_cov
             else:
                 q = transition_cov(mean, action) if callable(transition_cov) else transition_cov
-                mean, cov = predict(mean, cov, transition, q, action, jacobian)
+                f = jacobian(mean, action).detach() if callable(jacobian) else jacobian
+                mean, cov = predict(mean, cov.detach(), transition, q, action, f)
             offset = None
             if action_matrix is not None or bias is not None:
                 offset = torch.zeros_like(observation[b, t])

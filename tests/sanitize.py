@@ -76,7 +76,7 @@ def fuzz(count: int = 400) -> None:
             dtype=draw.choice([torch.float32, torch.float64]),
         )  # fmt: skip
         mean, action, x, seen, reset = problem.arguments()
-        arguments = [x, seen, action, reset, *problem.stored().values(), mean]
+        arguments = [x, seen, action, reset, *list(problem.stored().values())[:2], mean]
         arguments += native.operator_arguments(problem.model())
         spoilt = draw.random() < 0.5
         if spoilt:

@@ -237,7 +237,7 @@ def test_it_survives_a_file_a_copy_and_a_cast():
         ({"obs_dim": 0}, "must be an int of at least 1, got 0"),
         ({"action_dim": 0}, "`action_dim` must be an int of at least 1, got 0"),
         ({"obs_dim": 0, "state_dim": None}, "`obs_dim` must be an int of at least 1, got 0"),
-        ({"covariance": "propagated"}, "`covariance` must be 'constant', got 'propagated'"),
+        ({"covariance": "grown"}, "`covariance` must be one of constant, propagated, got 'grown'"),
         ({"initial_cov": "scalar"}, "`initial_cov` must be one of diag, full, got 'scalar'"),
         ({"initial_std": 0.0}, "`initial_std` must be above its floor"),
         ({"transition": GaussianTransition(4, ACTION)}, "has state_dim=4, the filter state_dim=3"),

@@ -42,7 +42,7 @@ def row(problem: Problem) -> tuple:
     """The operator's arguments."""
     mean, action, x, seen, reset = problem.arguments()
     return (
-        x, seen, action, reset, *problem.stored().values(), mean,
+        x, seen, action, reset, *list(problem.stored().values())[:2], mean,
         *native.operator_arguments(problem.model()),
     )  # fmt: skip
 
@@ -102,7 +102,7 @@ def test_what_it_does_not_take_it_names():
             name: tuple(x.half() for x in getattr(model.transition, name))
             for name in ("weights", "biases")
         }),
-        *(getattr(model, name).half() for name in list(vars(model))[1:]),
+        *(getattr(model, name).half() for name in list(vars(model))[1:8]),
     )  # fmt: skip
     assert reason(half) == "there is none for torch.float16"
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
@@ -42,9 +43,12 @@ class Belief:
         summary: numbers worth a column in metrics.csv, asked for once a rollout.
         observing: makes a module with the weights of ``module`` that also writes what the belief
             knows of the sensors (see the top of this file); None where it knows nothing.
+        after_rollout: called with a rollout once its epochs are over, and with the first one, from
+            which statistics are taken: for what is learned otherwise than by gradients.
     """
 
     module: TensorDictModuleBase
     feature_dim: int
     summary: Callable[[], Mapping[str, float]] = dict
     observing: Callable[[], TensorDictModuleBase] | None = None
+    after_rollout: Callable[[TensorDictBase], None] = lambda _: None

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
@@ -71,6 +72,7 @@ def build(
     transition: Mapping[str, Any],
     emission: Mapping[str, Any],
     initial: Mapping[str, Any],
+    covariance: Literal["constant", "propagated"] = "constant",  # of runs that do not name it
 ) -> Belief:
     """Build the belief filter, see conf/belief/drbpn.yaml."""
     state = min(obs_dim, 32) if state_dim is None else state_dim
@@ -84,6 +86,7 @@ def build(
         state,
         transition=GaussianTransition(state, action_dim, **moves),
         emission=LinearGaussianEmission(obs_dim, state, action_dim, **emission),
+        covariance=covariance,
         **initial,
     )
     module = BeliefFilterModule(belief_filter, in_keys=_READ, policy_input=policy_input)
@@ -93,10 +96,17 @@ def build(
             std = belief_filter.emission.cov().diagonal().sqrt()
         return {"emission_noise_std": std.mean().item()}
 
-    covariance = state * (state + 1) // 2 if policy_input == "mean_cov" else 0
+    def after_rollout(data: TensorDictBase) -> None:
+        if covariance == "propagated":
+            following = data.get("next")
+            belief_filter.refresh_jacobian(
+                following.get(("recurrent", "mean")), following.get("previous_action")
+            )
+
     return Belief(
         module,
-        state + covariance,
+        module.feature_dim,
         summary=summary,
         observing=lambda: observing(module),
+        after_rollout=after_rollout,
     )

@@ -67,6 +67,7 @@ class Agent(nn.Module):
         self.norm, self.belief, self.actor, self.critic = norm, belief.module, actor, critic
         self.summary: Callable[[], Mapping[str, float]] = belief.summary
         self.observing: Callable[[], TensorDictModuleBase] | None = belief.observing
+        self._after_rollout = belief.after_rollout
         # Not registered a second time: its parts are above.
         self.__dict__["policy"] = TensorDictSequential(norm, belief.module, actor)
 
@@ -76,6 +77,11 @@ class Agent(nn.Module):
     def recurrent(self) -> bool:
         """Return whether the belief module carries a state from step to step."""
         return get_primers_from_module(self.belief, warn=False) is not None
+
+    def after_rollout(self, data: TensorDictBase) -> None:
+        """Let what learns otherwise than by gradients learn from a rollout, after its epochs."""
+        self.norm.update(data)
+        self._after_rollout(data)
 
     def value(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Return V of the beliefs that are stored in a rollout, shape ``(*, 1)``."""

@@ -61,7 +61,7 @@ from torchrl_drbpn.functional.smoothing import (
     row_jacobian,
     smooth_sequence,
 )
-from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP, predict_step
+from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP, predict_step, propagate
 
 __all__ = [
     "Belief",
@@ -105,6 +105,7 @@ __all__ = [
     "positive_std",
     "predict",
     "predict_step",
+    "propagate",
     "resample",
     "row_jacobian",
     "sample_delay",

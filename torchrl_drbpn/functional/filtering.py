@@ -5,9 +5,11 @@ every transformation; :mod:`.native` is one operator on the CPU. :func:`.unsuppo
 rule which runs.
 
 Where Q is constant, predicted covariances depend on the episode starts alone, so that the gains of
-a whole minibatch are one batched computation ahead of the mean recurrence. The gain comes from what
-is cheaper to factorise: S = H P H' + R, obs x obs, or the precision inv(P) + H' inv(R) H, state x
-state (diagonal R, obs > state). A Q that depends on the state takes :mod:`.kalman` step by step.
+a whole minibatch are one batched computation ahead of the mean recurrence. Where they are
+propagated by one Jacobian they depend on masks and episode starts: their recursion runs before,
+without gradient. The gain comes from what is cheaper to factorise: S = H P H' + R, obs x obs, or
+the precision inv(P) + H' inv(R) H, state x state (diagonal R, obs > state). A Q or a Jacobian that
+depends on the state takes :mod:`.kalman` step by step.
 """
 
 from __future__ import annotations
@@ -26,19 +28,24 @@ from torchrl_drbpn.functional.gaussian import (
     LOG_2PI,
     Belief,
     masked_cov,
+    rounded_cov,
     without_autocast,
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import log_likelihood, update
-from torchrl_drbpn.functional.state_space import StateSpace, predict_step
+from torchrl_drbpn.functional.state_space import StateSpace, predict_step, propagate
 
 __all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
 
 Form = Literal["auto", "pytorch", "native"]
-# observation, observed, action, reset, use_stored_state, stored_mean as (batch, time, ...), and the
-# mean (batch, state) before.
-Sequence = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor]
-# Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step.
+# observation, observed, action, reset, use_stored_state, stored_mean as (batch, time, ...), the
+# mean (batch, state) before; stored_cov and the cov before where it is propagated.
+Sequence = tuple[
+    Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor | None,
+    Tensor | None,
+]  # fmt: skip
+# Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step; leaves alone
+# what is there for every step.
 Choose = Callable[[Tensor], Tensor]
 Gains = tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]
 
@@ -48,8 +55,8 @@ class FilterOutput(NamedTuple):
 
     Args:
         mean: filtered mean, shape ``(*batch, [time,] state)``.
-        cov: filtered covariance, shape ``(*batch, [time,] state, state)``; None where not asked
-            for.
+        cov: filtered covariance, shape ``(*batch, [time,] state, state)``. Where it is propagated
+            it is always there, without gradient unless asked for; else None where not asked for.
         log_likelihood: of each step, shape ``(*batch, [time])``, nats.
 
     Example:
@@ -72,30 +79,14 @@ def filter_step(
     observed: Tensor,
     reset: Tensor,
     *,
+    cov: Tensor | None = None,
     return_cov: bool = False,
     form: Form = "auto",
 ) -> FilterOutput:
     """Filter one step for any batch of beliefs: a sequence of one.
 
-    Eq. (8), (10), (12) [DRBPN].
-
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before, shape ``(*batch, state)``.
-        previous_action: shape ``(*batch, action)``.
-        observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``.
-        reset: bool, shape ``(*batch,)``; True starts from the initial belief.
-
-    Keyword Args:
-        return_cov: whether the filtered covariance is wanted.
-        form: see :func:`filter_sequence`.
-
-    Returns:
-        :class:`FilterOutput` of shapes ``(*batch, ...)``.
-
-    Raises:
-        ValueError: as :func:`filter_sequence`.
+    Eq. (8), (10), (12) [DRBPN]. Arguments, result and errors are those of
+    :func:`filter_sequence`, without the dimension of time.
 
     Example:
         >>> import torch
@@ -110,13 +101,15 @@ def filter_step(
         (True, True)
     """
     steps = tuple(reset.shape)
-    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset)
+    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset, cov=cov)
     out = _filter(
-        model, observation.unsqueeze(-2), observed.unsqueeze(-2), previous_action.unsqueeze(-2),
-        reset.unsqueeze(-1), None, None, mean, return_cov, form,
+        model,
+        (observation.unsqueeze(-2), observed.unsqueeze(-2), previous_action.unsqueeze(-2),
+         reset.unsqueeze(-1), None, None, mean, None, cov),
+        return_cov, form,
     )  # fmt: skip
-    cov = None if out.cov is None else out.cov.squeeze(-3)
-    return FilterOutput(out.mean.squeeze(-2), cov, out.log_likelihood.squeeze(-1))
+    filtered = None if out.cov is None else out.cov.squeeze(-3)
+    return FilterOutput(out.mean.squeeze(-2), filtered, out.log_likelihood.squeeze(-1))
 
 
 def filter_sequence(
@@ -127,8 +120,10 @@ def filter_sequence(
     observed: Tensor,
     reset: Tensor,
     *,
+    cov: Tensor | None = None,
     use_stored_state: Tensor | None = None,
     stored_mean: Tensor | None = None,
+    stored_cov: Tensor | None = None,
     return_cov: bool = False,
     form: Form = "auto",
 ) -> FilterOutput:
@@ -145,18 +140,22 @@ def filter_sequence(
         reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
 
     Keyword Args:
+        cov: filtered covariance of the step before the first, shape ``(*batch, state, state)``;
+            needed, and read, where the model propagates it.
         use_stored_state: bool, shape ``(*batch, time)``; True takes the belief of the step before
-            from ``stored_mean`` instead of from the sequence.
+            from ``stored_mean`` (and ``stored_cov``) instead of from the sequence.
         stored_mean: shape ``(*batch, time, state)``; read where ``use_stored_state`` is True.
-        return_cov: whether the filtered covariances are wanted.
+        stored_cov: shape ``(*batch, time, state, state)``; as ``cov``.
+        return_cov: whether the filtered covariances are wanted, with their gradient.
         form: "auto" runs the native form where it can; "pytorch" and "native" force one.
 
     Returns:
         :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
 
     Raises:
-        ValueError: for a wrong shape or dtype, if form="native" cannot run, or one of
-            ``use_stored_state`` and ``stored_mean`` is given without the other.
+        ValueError: for a wrong shape or dtype, a propagated covariance that is missing, if
+            form="native" cannot run, or one of ``use_stored_state`` and ``stored_mean`` is given
+            without the other.
 
     Example:
         >>> import torch
@@ -179,58 +178,49 @@ def filter_sequence(
     steps = tuple(reset.shape)
     model.check_inputs(
         steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
-        stored_mean,
+        stored_mean, stored_cov, cov,
     )  # fmt: skip
     return _filter(
-        model, observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
+        model, (observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
+                stored_cov, cov),
         return_cov, form,
     )  # fmt: skip
 
 
-def _filter(
-    model: StateSpace,
-    observation: Tensor,
-    observed: Tensor,
-    action: Tensor,
-    reset: Tensor,
-    use_stored_state: Tensor | None,
-    stored_mean: Tensor | None,
-    mean: Tensor,
-    return_cov: bool,
-    form: Form,
-) -> FilterOutput:
+def _filter(model: StateSpace, given: Sequence, return_cov: bool, form: Form) -> FilterOutput:
     """Choose the form, and filter checked inputs as rows."""
     if form not in ("auto", "pytorch", "native"):
         raise ValueError(f"`form` must be 'auto', 'pytorch' or 'native', got {form!r}.")
-    *batch, time = reset.shape
+    F = model.transition_jacobian
+    if F is None:
+        given = (*given[:7], None, None)
+    *batch, time = given[3].shape
 
-    def rows(x: Tensor) -> Tensor:  # not -1: there may be no step at all
-        return x.reshape(math.prod(batch), *x.shape[len(batch) :])
+    def rows(x: Tensor | None) -> Tensor | None:  # not -1: there may be no step at all
+        return None if x is None else x.reshape(math.prod(batch), *x.shape[len(batch) :])
 
-    sequence: Sequence = (
-        rows(observation), rows(observed), rows(action), rows(reset),
-        None if use_stored_state is None else rows(use_stored_state),
-        None if stored_mean is None else rows(stored_mean), rows(mean),
-    )  # fmt: skip
+    sequence: Sequence = tuple(map(rows, given))  # type: ignore[assignment]
     reason: str | None = "PyTorch was asked for"
     if form != "pytorch":
-        reason = native.unsupported_reason(model, observation, action, stored_mean, mean)
+        reason = native.unsupported_reason(model, given[0], given[2], *given[5:])
         if reason is not None and form == "native":
             raise ValueError(f"`form` 'native' cannot run here: {reason}. Use form='auto'.")
         if not torch.compiler.is_compiling() and reason and reason == native.native_status():
             _warn_once(reason)
-    with without_autocast(mean):
-        cov = None
-        if not isinstance(model.transition_cov, Tensor):
+    with without_autocast(given[6]):
+        cov: Tensor | None
+        if not isinstance(model.transition_cov, Tensor) or callable(F):
             filtered, cov, ll = _run_step_by_step(model, *sequence)
-            cov = cov.reshape(*batch, *cov.shape[1:]) if return_cov else None
         else:
-            if reason is None:
-                filtered, ll = native.filter_rows(model, sequence)
-            else:
-                filtered, ll = run_in_pytorch(model, *sequence)
-            if return_cov:
-                cov = filtered_cov(model, observed, reset)
+            run = native.filter_rows if reason is None else run_in_pytorch
+            filtered, cov, ll = run(model, *sequence)
+            if return_cov and cov is None:
+                cov = filtered_cov(model, sequence[1], sequence[3])
+            elif return_cov and cov is not None:
+                cov = _differentiable_cov(model, sequence, cov)
+    if cov is not None and not return_cov:
+        cov = None if F is None else cov.detach()
+    cov = None if cov is None else cov.reshape(*batch, *cov.shape[1:])
     return FilterOutput(
         filtered.reshape(*batch, time, model.state_dim), cov, ll.reshape(*batch, time)
     )
@@ -270,11 +260,34 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
         >>> torch.allclose(cov, torch.diag(torch.tensor([0.75, 1.0])))
         True
     """
-    cov = torch.where(reset[..., None, None], model.full_initial_cov(), model.constant_cov())
-    zero = torch.zeros((), dtype=cov.dtype, device=cov.device)
-    predicted = Belief(zero.expand(*reset.shape, model.state_dim), cov)
+    if model.transition_jacobian is not None:
+        raise ValueError(
+            "`model` propagates its covariance, which depends on the whole past: ask "
+            "filter_sequence or filter_step for it."
+        )
+    P = torch.where(reset[..., None, None], model.full_initial_cov(), model.constant_cov())
+    return _updated_cov(model, P, observed)
+
+
+def _updated_cov(model: StateSpace, P: Tensor, observed: Tensor) -> Tensor:
+    zero = torch.zeros((), dtype=P.dtype, device=P.device)
+    predicted = Belief(zero.expand(P.shape[:-1]), P)
     H, R = model.emission_matrix, model.emission_cov
     return update(predicted, zero.expand(observed.shape), observed, H, R).cov
+
+
+def _differentiable_cov(model: StateSpace, sequence: Sequence, filtered: Tensor) -> Tensor:
+    """Return propagated covariances with the gradient of one step: that before is a constant."""
+    _, observed, _, reset, use_stored_state, _, _, stored_cov, cov = sequence
+    F = model.transition_jacobian
+    assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
+    before = torch.cat([cov.unsqueeze(1), filtered], 1)[:, :-1]
+    if use_stored_state is not None and stored_cov is not None:
+        before = torch.where(use_stored_state[..., None, None], stored_cov, before)
+    first = reset[..., None, None]
+    moved = propagate(F, before.masked_fill(first, 0.0)) + model.constant_cov()
+    P = torch.where(first, model.full_initial_cov().double(), moved)
+    return _updated_cov(model, P.to(filtered.dtype), observed)
 
 
 # ------------------------------------------------------------------ the PyTorch form
@@ -287,8 +300,10 @@ def run_in_pytorch(
     use_stored_state: Tensor | None,
     stored_mean: Tensor | None,
     mean: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Filter rows ``(batch, time, ...)``; return filtered means and log-likelihoods.
+    stored_cov: Tensor | None = None,
+    cov: Tensor | None = None,
+) -> tuple[Tensor, Tensor | None, Tensor]:
+    """Filter rows ``(batch, time, ...)``; return means, propagated covariances, log-likelihoods.
 
     In float64 but for the transition: with R at its floor float32 loses most digits of a gain.
     """
@@ -298,6 +313,17 @@ def run_in_pytorch(
     def choose(pair: Tensor) -> Tensor:
         first = reset.view(*reset.shape, *(1,) * (pair.ndim - 1))
         return torch.where(first, pair[0], pair[1])
+
+    filtered_covs = None
+    if model.transition_jacobian is not None:
+        own = choose(covs)
+        covs, filtered_covs = _run_covariances(
+            model, own, observed, reset, use_stored_state, stored_cov, cov
+        )
+        filtered_covs = rounded_cov(filtered_covs, dtype)
+
+        def choose(pair: Tensor) -> Tensor:
+            return pair
 
     gains = _information if model.information_form else _innovation
     gain, likelihood = gains(H, model.emission_cov.double(), covs, choose, observed)
@@ -318,10 +344,61 @@ def run_in_pytorch(
         moves.append(move)
         filtered.append(mean)
     if not filtered:
-        return mean.unsqueeze(1)[:, :0], y.sum(-1).to(dtype)
+        return mean.unsqueeze(1)[:, :0], filtered_covs, y.sum(-1).to(dtype)
     residual = zero_missing(torch.stack(innovations, 1), observed)
-    ll = likelihood(residual, moves)
-    return torch.stack(filtered, 1), torch.where(observed.any(-1), ll, 0.0).to(dtype)
+    ll = torch.where(observed.any(-1), likelihood(residual, moves), 0.0).to(dtype)
+    return torch.stack(filtered, 1), filtered_covs, ll
+
+
+def _run_covariances(
+    model: StateSpace,
+    own: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    use_stored_state: Tensor | None,
+    stored_cov: Tensor | None,
+    cov: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Propagate and update covariances ahead of the means; ``own`` is Q or P_0 of each step.
+
+    Returns:
+        The predicted ones, with the gradient by ``own`` alone, and the filtered ones, without;
+        float64, ``(batch, time, state, state)``.
+    """
+    F, time = model.transition_jacobian, reset.shape[1]
+    assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
+    H, R = model.emission_matrix.detach().double(), model.emission_cov.detach().double()
+    value, sigma = own.detach(), cov.detach().double()
+    predicted, filtered = [], []
+    # The state before a step that starts anew, or from what is stored, comes from here.
+    given, ahead = reset, torch.zeros_like(value)
+    if use_stored_state is not None and stored_cov is not None:
+        given = reset | use_stored_state
+        ahead = stored_cov.detach().masked_fill(reset[..., None, None], 0.0).double()
+    if model.information_form:
+        weight = observed / R
+        outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
+        gained = (weight @ outer).view(value.shape)
+    else:
+        rows = zero_missing(H, observed.unsqueeze(-1))  # M'M H
+        noise = masked_cov(R.diag() if R.ndim == 1 else R, observed)
+    for t in range(time):
+        sigma = torch.where(given[:, t, None, None], ahead[:, t], sigma)
+        P = propagate(F, sigma) + value[:, t]
+        if model.information_form:
+            precision = torch.cholesky_inverse(torch.linalg.cholesky_ex(P)[0]) + gained[:, t]
+            sigma = torch.cholesky_inverse(torch.linalg.cholesky_ex(precision)[0])
+        else:
+            h = rows[:, t]
+            cross = h @ P
+            factor, _ = torch.linalg.cholesky_ex(torch.baddbmm(noise[:, t], cross, h.mT))
+            white = torch.linalg.solve_triangular(factor, cross, upper=False)
+            sigma = torch.baddbmm(P, white.mT, white, alpha=-1)
+        predicted.append(P)
+        filtered.append(sigma)
+    if not predicted:
+        return own, value
+    return torch.stack(predicted, 1) + (own - value), torch.stack(filtered, 1)
 
 
 def _innovation(H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor) -> Gains:
@@ -385,14 +462,19 @@ def _run_step_by_step(
     use_stored_state: Tensor | None,
     stored_mean: Tensor | None,
     mean: Tensor,
+    stored_cov: Tensor | None,
+    cov: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Filter by :mod:`.kalman` at every step; return means, covariances, log-likelihoods."""
     H, R, offset = model.emission_matrix, model.emission_cov, model.offset(action)
     means, covs, lls = [], [], []
     for t in range(reset.shape[1]):
         if use_stored_state is not None and stored_mean is not None:
-            mean = torch.where(use_stored_state[:, t, None], stored_mean[:, t], mean)
-        predicted = predict_step(model, mean, action[:, t], reset[:, t])
+            use = use_stored_state[:, t, None]
+            mean = torch.where(use, stored_mean[:, t], mean)
+            if stored_cov is not None and cov is not None:
+                cov = torch.where(use.unsqueeze(-1), stored_cov[:, t], cov)
+        predicted = predict_step(model, mean, action[:, t], reset[:, t], cov)
         step = (observation[:, t], observed[:, t], H, R, offset[:, t])
         lls.append(log_likelihood(predicted, *step))
         mean, cov = update(predicted, *step)

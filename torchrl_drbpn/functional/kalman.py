@@ -21,6 +21,7 @@ from torchrl_drbpn.functional.gaussian import (
     factorise,
     masked_cov,
     masked_log_density,
+    rounded_cov,
     zero_missing,
 )
 
@@ -188,12 +189,7 @@ def update(
     mean = belief.mean + (K @ v.unsqueeze(-1)).squeeze(-1).to(dtype)
     kept = torch.eye(mean.shape[-1], dtype=P.dtype, device=P.device) - K @ H
     cov = kept @ P @ kept.mT + K @ R @ K.mT
-    cov = (0.5 * (cov + cov.mT)).to(dtype)
-    # Rounding errs by at most eps/2 sqrt(C_ii C_jj) in every entry. Directions measured thousands
-    # of times without a predict between hold less variance than that beside directions never
-    # measured; raising the diagonal by state * eps/2 of itself outweighs it whatever the signs.
-    unit = 0.5 * cov.shape[-1] * torch.finfo(cov.dtype).eps
-    cov = cov + torch.diag_embed(unit * cov.diagonal(dim1=-2, dim2=-1).detach())
+    cov = rounded_cov(cov, dtype)
     anything = observed.any(-1)[..., None, None]
     return Belief(mean, torch.where(anything, cov, P.to(dtype)))
 

@@ -67,7 +67,9 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     f, Q = model.transition, model.transition_cov
     if not isinstance(f, TransitionMLP) or not isinstance(Q, Tensor):
         return "it takes a TransitionMLP with a constant transition_cov"
-    own = (Q, *list(vars(model).values())[2:], *f.weights, *f.biases)
+    if model.transition_jacobian is not None:
+        return "it takes a constant covariance"
+    own = (Q, *list(vars(model).values())[2:8], *f.weights, *f.biases)
     given = [x for x in (*own, *tensors) if x is not None]
     if torch.compiler.is_compiling():
         return "torch.compile and torch.export trace PyTorch's operations"
@@ -99,9 +101,12 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     return native_status()
 
 
-def filter_rows(model: StateSpace, sequence: Sequence[Tensor | None]) -> tuple[Tensor, Tensor]:
+def filter_rows(
+    model: StateSpace, *sequence: Tensor | None
+) -> tuple[Tensor, Tensor | None, Tensor]:
     """Filter what :func:`unsupported_reason` has nothing against, as ``run_in_pytorch`` does."""
-    return torch.ops.torchrl_drbpn.filter_rows(*sequence, *operator_arguments(model))[:2]
+    out = torch.ops.torchrl_drbpn.filter_rows(*sequence[:7], *operator_arguments(model))
+    return out[0], None, out[1]
 
 
 def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
@@ -302,7 +307,7 @@ class _Filter(torch.autograd.Function):
 
         Q, P0, R, H, B, d, m0, network = saved[7:]
         model = StateSpace(_unpacked(network, Q, B, *ctx.rest), Q, H, R, B, d, m0, P0)
-        outputs = run_in_pytorch(model, *saved[:7])
+        outputs = run_in_pytorch(model, *saved[:7])[::2]
         pairs = [(o, g) for o, g in zip(outputs, by_outputs[:2], strict=True) if g is not None]
         values, weights = zip(*pairs, strict=True)
         wanted = [x for x in saved if x is not None and x.requires_grad]

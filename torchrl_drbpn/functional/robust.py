@@ -23,6 +23,7 @@ def saturate_innovation(
     observed: Tensor,
     reset: Tensor,
     gate: float,
+    cov: Tensor | None = None,
 ) -> Tensor:
     r"""Move every reading to within ``gate`` deviations of its forecast.
 
@@ -53,6 +54,8 @@ def saturate_innovation(
         observed: bool, shape ``(*batch, obs)``, True = arrived.
         reset: bool, shape ``(*batch,)``; True starts from the initial belief.
         gate: g, standard deviations of the forecast.
+        cov: filtered covariance of the step before, ``(*batch, state, state)``; read where the
+            model propagates it.
 
     Returns:
         Readings, shape ``(*batch, obs)``; NaN and inf that arrived stay what they are.
@@ -77,9 +80,9 @@ def saturate_innovation(
     """
     check_gate(gate)
     steps = tuple(reset.shape)
-    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset)
+    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset, cov=cov)
     with without_autocast(mean):
-        predicted = predict_step(model, mean, previous_action, reset)
+        predicted = predict_step(model, mean, previous_action, reset, cov)
         H = model.emission_matrix
         expected = predicted.mean @ H.mT + model.offset(previous_action)
         deviation = reading_variance(H, predicted.cov, model.emission_cov).sqrt()

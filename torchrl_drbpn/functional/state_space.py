@@ -12,7 +12,11 @@ from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix
 
-__all__ = ["StateSpace", "TransitionMLP", "predict_step"]
+__all__ = ["StateSpace", "TransitionMLP", "predict_step", "propagate"]
+
+# Of a propagated variance, state units: under a transition that expands, what no sensor has seen
+# for thousands of steps would leave the range of float32. The correlations stay.
+MAX_VARIANCE = 1e6
 
 
 class TransitionMLP(NamedTuple):
@@ -52,6 +56,51 @@ class TransitionMLP(NamedTuple):
                 hidden = hidden.relu() if self.activation == "relu" else hidden.tanh()
         return mean + hidden if self.residual else hidden
 
+    def jacobian(self, mean: Tensor, action: Tensor, *, average: bool = False) -> Tensor:
+        r"""Return the derivative of f by the mean, of each row or its mean over all rows.
+
+        .. math::
+            J_r = [I +] \; W_k D_r^{k-1} W_{k-1} \dots D_r^1 W_1, \qquad
+            \frac1N \sum_r W_3 D_r^2 W_2 D_r^1 W_1
+            = W_3 \left(\tfrac1N d_2' d_1 \circ W_2\right) W_1
+
+        :math:`D_r^i` is the diagonal of the activation's derivatives :math:`d_i`, shape
+        ``(N, width)``; of :math:`W_1` the columns of the mean count.
+
+        Args:
+            mean: shape ``(*batch, state)``.
+            action: shape ``(*batch, action)``.
+
+        Keyword Args:
+            average: whether the mean over the batch is wanted.
+
+        Returns:
+            Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
+        """
+        state = mean.shape[-1]
+        hidden, slopes = torch.cat([mean, action], -1), []
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            before = torch.nn.functional.linear(hidden, weight, bias)
+            hidden = before.relu() if self.activation == "relu" else before.tanh()
+            slope = (before > 0).to(mean.dtype) if self.activation == "relu" else 1 - hidden**2
+            slopes.append(slope.reshape(-1, slope.shape[-1]))
+        first, last = self.weights[0][:, :state], len(slopes)
+        if average and last <= 2:
+            found = first
+            if last == 1:
+                found = self.weights[1] @ (slopes[0].mean(0).unsqueeze(-1) * first)
+            elif last == 2:
+                both = slopes[1].mT @ slopes[0] / len(slopes[0])
+                found = self.weights[2] @ (both * self.weights[1]) @ first
+        else:
+            found = first.expand(mean[..., 0].numel(), -1, -1)
+            for slope, weight in zip(slopes, self.weights[1:], strict=True):
+                found = weight @ (slope.unsqueeze(-1) * found)
+            found = found.mean(0) if average else found.reshape(*mean.shape, state)
+        if not self.residual:
+            return found
+        return found + torch.eye(state, dtype=mean.dtype, device=mean.device)
+
 
 @dataclass(eq=False)
 class StateSpace:
@@ -76,6 +125,9 @@ class StateSpace:
         emission_offset: d, shape ``(obs,)``.
         initial_mean: m_0, shape ``(state,)``.
         initial_cov: P_0, ``(state, state)`` or ``(state,)``.
+        transition_jacobian: F, the derivative of f by the mean, ``(state, state)`` of every step
+            alike; or a callable of (mean, action) that returns ``(*batch, state, state)``. It
+            propagates the covariance: P = F cov F' + Q. None: P = Q (eq. 8).
 
     Raises:
         ValueError: for a field of another shape, dtype or device.
@@ -98,6 +150,7 @@ class StateSpace:
     emission_offset: Tensor
     initial_mean: Tensor
     initial_cov: Tensor
+    transition_jacobian: Tensor | Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -117,6 +170,8 @@ class StateSpace:
         ]
         if isinstance(self.transition_cov, Tensor):
             fields.append(("transition_cov", self.transition_cov, (state, state)))
+        if isinstance(self.transition_jacobian, Tensor):
+            fields.append(("transition_jacobian", self.transition_jacobian, (state, state)))
         if isinstance(self.transition, TransitionMLP):
             weights, biases = self.transition.weights, self.transition.biases
             if len(weights) != len(biases):
@@ -153,8 +208,10 @@ class StateSpace:
         reset: Tensor,
         use_stored_state: Tensor | None = None,
         stored_mean: Tensor | None = None,
+        stored_cov: Tensor | None = None,
+        cov: Tensor | None = None,
     ) -> None:
-        """Raise unless ``mean`` is (*start, state), all others (*steps, n), and dtypes fit."""
+        """Raise unless ``mean``, ``cov`` are (*start, ...), all others (*steps, n); dtypes fit."""
         obs, state, action = self.obs_dim, self.state_dim, self.action_dim
         own, flag = self.emission_matrix.dtype, torch.bool
         wanted: tuple[tuple[str, Tensor | None, torch.dtype, str, tuple[int, ...]], ...] = (
@@ -165,7 +222,18 @@ class StateSpace:
             ("mean", mean, own, " state", (*start, state)),
             ("use_stored_state", use_stored_state, flag, "", steps),
             ("stored_mean", stored_mean, own, " state", (*steps, state)),
+            ("cov", cov, own, " state, state", (*start, state, state)),
+            ("stored_cov", stored_cov, own, " state, state", (*steps, state, state)),
         )
+        if self.transition_jacobian is not None:
+            for name, value, needed in (
+                ("cov", cov, True), ("stored_cov", stored_cov, use_stored_state is not None),
+            ):  # fmt: skip
+                if needed and value is None:
+                    raise ValueError(
+                        f"`{name}` is None, but this model propagates its covariance: pass the "
+                        "filtered covariance beside the mean."
+                    )
         for name, value, dtype, word, shape in wanted:
             if value is None or (value.shape == shape and value.dtype == dtype):
                 continue
@@ -228,18 +296,57 @@ class StateSpace:
         return torch.where(reset, self.initial_mean, self.transition(mean, previous_action))
 
 
-def predict_step(model: StateSpace, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
+def propagate(jacobian: Tensor, cov: Tensor) -> Tensor:
+    r"""Carry a covariance over a linear map, as a constant of autograd.
+
+    .. math:: F \Sigma F'
+
+    float64, symmetric, and no variance over 1e6: rows and columns that would have one are scaled
+    down, which leaves a covariance with the same correlations.
+
+    Args:
+        jacobian: F, shape ``(*batch, state, state)`` or ``(state, state)``.
+        cov: shape ``(*batch, state, state)``.
+
+    Returns:
+        Shape ``(*batch, state, state)``.
+
+    Example:
+        >>> import torch
+        >>> propagate(2 * torch.eye(2), torch.eye(2)).diagonal().tolist()
+        [4.0, 4.0]
+    """
+    F = jacobian.detach().double()
+    moved = F @ cov.detach().double() @ F.mT
+    moved = 0.5 * (moved + moved.mT)
+    scale = (MAX_VARIANCE / moved.diagonal(dim1=-2, dim2=-1)).clamp(max=1.0).sqrt()
+    return moved * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+
+
+def predict_step(
+    model: StateSpace,
+    mean: Tensor,
+    previous_action: Tensor,
+    reset: Tensor,
+    cov: Tensor | None = None,
+) -> Belief:
     r"""Predict one step, or start an episode from the initial belief.
 
-    .. math:: m^- = f(m, a), \; P^- = Q; \qquad \text{at a reset } m^- = m_0, \; P^- = P_0
+    .. math::
+        m^- = f(m, a), \; P^- = [F \Sigma F' +] Q; \qquad
+        \text{at a reset } m^- = m_0, \; P^- = P_0
 
-    Eq. (8) [DRBPN].
+    Eq. (8) [DRBPN]; differs from the paper: with a ``transition_jacobian`` F the covariance is
+    propagated, as in the extended Kalman filter (§5.2 [Särkkä 2013]). F and the covariance before
+    are constants of autograd.
 
     Args:
         model: the state-space model.
         mean: filtered mean of the step before, shape ``(*batch, state)``.
         previous_action: shape ``(*batch, action)``.
         reset: bool, shape ``(*batch,)``.
+        cov: filtered covariance of the step before, shape ``(*batch, state, state)``; read where
+            it is propagated.
 
     Returns:
         The predicted belief.
@@ -256,8 +363,13 @@ def predict_step(model: StateSpace, mean: Tensor, previous_action: Tensor, reset
     """
     row = reset.unsqueeze(-1)
     predicted = model.predicted_mean(mean, previous_action, row)
-    if isinstance(model.transition_cov, Tensor):
-        cov = model.constant_cov()
-    else:
-        cov = model.transition_cov(mean.masked_fill(row, 0.0), previous_action)
-    return Belief(predicted, torch.where(row.unsqueeze(-1), model.full_initial_cov(), cov))
+    mean = mean.masked_fill(row, 0.0)
+    Q, F = model.transition_cov, model.transition_jacobian
+    after = model.constant_cov() if isinstance(Q, Tensor) else Q(mean, previous_action)
+    if F is not None:
+        if cov is None:
+            raise ValueError("`cov` is None, but this model propagates its covariance.")
+        F = F if isinstance(F, Tensor) else F(mean, previous_action)
+        moved = propagate(F, cov.masked_fill(row.unsqueeze(-1), 0.0))
+        after = after + moved.to(after.dtype)
+    return Belief(predicted, torch.where(row.unsqueeze(-1), model.full_initial_cov(), after))

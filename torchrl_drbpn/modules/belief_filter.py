@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -26,7 +27,9 @@ from torchrl_drbpn.modules.state_space import (
     GaussianTransition,
     LearnedCovariance,
     LinearGaussianEmission,
+    check_choice,
     check_dim,
+    jacobian_of,
     transition_functions,
 )
 
@@ -67,7 +70,12 @@ class BeliefFilter(nn.Module):
         emission: default :class:`LinearGaussianEmission`.
         initial_std: standard deviation that initial_cov starts from, state units.
         initial_cov: "diag" or "full".
-        covariance: "constant": the predicted covariance is Q whatever came before (eq. 8).
+        covariance: "constant": the predicted covariance is Q whatever came before (eq. 8);
+            "propagated": it is F cov F' + Q, with F the derivative of the transition, so that it
+            grows while nothing arrives. Train as you act: each kind learns a Q of its own.
+        jacobian: what F is: "mean", the buffer ``mean_jacobian``, which
+            :meth:`refresh_jacobian` sets (the first call of a fresh filter does), so that all steps
+            of a batch are filtered at once; "row", the derivative at each belief, step by step.
         validate: look at values too, not only at shapes: a NaN or inf that the mask calls
             observed raises ValueError. Needs a value on the host, so it is skipped while
             compiling or exporting; switch it off under ``vmap``.
@@ -90,6 +98,8 @@ class BeliefFilter(nn.Module):
     See also :class:`torchrl_drbpn.BeliefFilterModule`, the same with TensorDict keys.
     """
 
+    mean_jacobian: Tensor
+
     def __init__(
         self,
         obs_dim: int,
@@ -100,14 +110,15 @@ class BeliefFilter(nn.Module):
         emission: LinearGaussianEmission | None = None,
         initial_std: float = 1.0,
         initial_cov: CovKind = "diag",
-        covariance: Literal["constant"] = "constant",
+        covariance: Literal["constant", "propagated"] = "constant",
+        jacobian: Literal["mean", "row"] = "mean",
         validate: bool = True,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        if covariance != "constant":
-            raise ValueError(f"`covariance` must be 'constant', got {covariance!r}.")
+        check_choice("covariance", covariance, ("constant", "propagated"))
+        check_choice("jacobian", jacobian, ("mean", "row"))
         if state_dim is None:
             given = getattr(transition, "state_dim", None) or getattr(emission, "state_dim", None)
             state_dim = given or min(check_dim("obs_dim", obs_dim), _MAX_DEFAULT_STATE)
@@ -132,7 +143,11 @@ class BeliefFilter(nn.Module):
                         f"`{part}` has {name}={its}, the filter {name}={mine}: build both with "
                         "the same dimensions."
                     )
-        self.covariance, self.validate = covariance, validate
+        self.covariance, self.jacobian, self.validate = covariance, jacobian, validate
+        if covariance == "propagated":
+            nothing = torch.full((state_dim, state_dim), torch.nan, **place)
+            self.register_buffer("mean_jacobian", nothing)
+        self._fresh = covariance == "propagated"
         self.initial_mean = nn.Parameter(torch.zeros(state_dim, **place))
         self.initial_noise = LearnedCovariance(
             state_dim, initial_cov, initial_std, _MIN_INITIAL_STD, name="initial_cov", **place
@@ -146,6 +161,12 @@ class BeliefFilter(nn.Module):
             reset = getattr(part, "reset_parameters", None)
             if callable(reset):
                 reset()
+        self._fresh = self.covariance == "propagated"
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        saved = state_dict.get(f"{prefix}mean_jacobian")
+        self._fresh = self._fresh and (saved is None or bool(saved.isnan().any()))
 
     # ------------------------------------------------------------------ the model as tensors
     @property
@@ -159,9 +180,33 @@ class BeliefFilter(nn.Module):
             mean, cov = transition_functions(self.transition)
             matrix, action_matrix, offset = self.emission.affine()
             R, initial_cov = self.emission.compact_cov(), self.initial_noise.compact()
+        F: Tensor | Callable[[Tensor, Tensor], Tensor] | None = None
+        if self.covariance == "propagated" and self.jacobian == "mean":
+            F = self.mean_jacobian
+        elif self.covariance == "propagated":
+            F = functools.partial(jacobian_of, self.transition)
         return StateSpace(
-            mean, cov, matrix, R, action_matrix, offset, self.initial_mean, initial_cov
+            mean, cov, matrix, R, action_matrix, offset, self.initial_mean, initial_cov, F
         )
+
+    @torch.no_grad()
+    def refresh_jacobian(self, mean: Tensor, previous_action: Tensor) -> None:
+        """Set ``mean_jacobian`` to the mean derivative of the transition over a batch of beliefs.
+
+        Call it once a rollout, after the epochs: in between it stays, so that what was collected
+        is filtered alike in the loss.
+
+        Args:
+            mean: filtered means, shape ``(*batch, state)``.
+            previous_action: what followed them, shape ``(*batch, action)``.
+
+        Raises:
+            ValueError: if the covariance is constant.
+        """
+        if self.covariance != "propagated":
+            raise ValueError("`refresh_jacobian` needs a filter with covariance='propagated'.")
+        self.mean_jacobian.copy_(jacobian_of(self.transition, mean, previous_action, average=True))
+        self._fresh = False
 
     @torch.no_grad()
     def _check_model(self) -> None:
@@ -205,43 +250,26 @@ class BeliefFilter(nn.Module):
         return_cov: bool = False,
         gate: float | None = None,
     ) -> FilterOutput:
-        """Filter one step.
+        """Filter one step; arguments, result and errors as in :meth:`forward`, without time.
 
-        Args:
-            mean: filtered mean of the step before, shape ``(*batch, state)``.
-            cov: its covariance, shape ``(*batch, state, state)``; not read by this model, whose
-                predicted covariance is Q whatever came before (eq. 8 [DRBPN]).
-            previous_action: shape ``(*batch, action)``.
-            observation: shape ``(*batch, obs)``; missing entries may hold anything.
-            observed: bool, shape ``(*batch, obs)``, True = arrived.
-            reset: bool, shape ``(*batch,)``, True = start from the initial belief.
-
-        Keyword Args:
-            return_cov: whether the filtered covariance is wanted.
-            gate: readings further than about this many standard deviations from their forecast
-                are filtered as if they lay at that distance, and the likelihood is that of these,
-                see :func:`torchrl_drbpn.functional.saturate_innovation`; None: believe them all.
-
-        Returns:
-            :class:`~torchrl_drbpn.functional.FilterOutput`: mean, cov (None where not asked
-            for), log_likelihood.
-
-        Raises:
-            ValueError: for a shape, a dtype, a gate or an observed value that cannot be.
+        ``gate``: readings further than about this many standard deviations from their forecast
+        are filtered as if they lay at that distance, and the likelihood is that of these, see
+        :func:`torchrl_drbpn.functional.saturate_innovation`; None: believe them all.
         """
-        del cov
-        model, believed = self.state_space(), observation
+        given = (mean, previous_action, observation, observed, reset)
+        model, cov = self._model(cov, previous_action)
+        believed = observation
         if gate is not None:
-            believed = saturate_innovation(
-                model, mean, previous_action, observation, observed, reset, gate
-            )
+            believed = saturate_innovation(model, *given, gate, cov=cov)
+
         # The error is about the readings as they arrived, not as they were moved.
-        return self._filter_checked(
-            lambda: filter_step(
-                model, mean, previous_action, believed, observed, reset, return_cov=return_cov
-            ),
-            mean, previous_action, observation, observed,
-        )  # fmt: skip
+        def run() -> FilterOutput:
+            return filter_step(
+                model, mean, previous_action, believed, observed, reset, cov=cov,
+                return_cov=return_cov,
+            )  # fmt: skip
+
+        return self._filter_checked(run, *given[:4])
 
     # ------------------------------------------------------------------ a sequence
     def forward(
@@ -255,13 +283,14 @@ class BeliefFilter(nn.Module):
         *,
         use_stored_state: Tensor | None = None,
         stored_mean: Tensor | None = None,
+        stored_cov: Tensor | None = None,
         return_cov: bool = False,
     ) -> FilterOutput:
         """Filter sequences, episode starts inside them included.
 
         Args:
             mean: filtered mean of the step before the first, shape ``(*batch, state)``.
-            cov: its covariance; not read by this model, see :meth:`step`.
+            cov: its covariance, shape ``(*batch, state, state)``; read where it is propagated.
             previous_action: shape ``(*batch, time, action)``.
             observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
             observed: bool, shape ``(*batch, time, obs)``, True = arrived.
@@ -269,8 +298,9 @@ class BeliefFilter(nn.Module):
 
         Keyword Args:
             use_stored_state: bool, shape ``(*batch, time)``; True takes the belief of the step
-                before from ``stored_mean`` instead of from the sequence.
+                before from ``stored_mean`` (and ``stored_cov``) instead of from the sequence.
             stored_mean: shape ``(*batch, time, state)``.
+            stored_cov: shape ``(*batch, time, state, state)``; as ``cov``.
             return_cov: whether the filtered covariances are wanted.
 
         Returns:
@@ -279,28 +309,31 @@ class BeliefFilter(nn.Module):
         Raises:
             ValueError: for a shape, a dtype or an observed value that cannot be.
         """
-        del cov
-        return self._filter_checked(
-            lambda: filter_sequence(
-                self.state_space(), mean, previous_action, observation, observed, reset,
-                use_stored_state=use_stored_state, stored_mean=stored_mean, return_cov=return_cov,
-            ),
-            mean, previous_action, observation, observed,
-        )  # fmt: skip
+        given = (mean, previous_action, observation, observed, reset)
+        model, cov = self._model(cov, previous_action)
 
-    def predict(self, mean: Tensor, previous_action: Tensor, reset: Tensor) -> Belief:
-        """Return the predicted belief, shapes as in :meth:`step`.
+        def run() -> FilterOutput:
+            return filter_sequence(
+                model, *given, cov=cov, use_stored_state=use_stored_state, stored_mean=stored_mean,
+                stored_cov=stored_cov, return_cov=return_cov,
+            )  # fmt: skip
 
-        Args:
-            mean: filtered mean of the step before, shape ``(*batch, state)``.
-            previous_action: shape ``(*batch, action)``.
-            reset: bool, shape ``(*batch,)``.
+        return self._filter_checked(run, *given[:4])
 
-        Returns:
-            The belief before the observation of this step.
-        """
+    def _model(self, cov: Tensor | None, action: Tensor) -> tuple[StateSpace, Tensor | None]:
+        """Return the model and the covariance that it reads; the first call sets the Jacobian."""
+        if self._fresh and self.jacobian == "mean":
+            start = self.initial_mean.detach()
+            self.refresh_jacobian(start.expand(*action.shape[:-1], len(start)), action)
+        return self.state_space(), None if self.covariance == "constant" else cov
+
+    def predict(
+        self, mean: Tensor, previous_action: Tensor, reset: Tensor, cov: Tensor | None = None
+    ) -> Belief:
+        """Return the belief before the observation of a step, shapes as in :meth:`step`."""
         with without_autocast(mean):
-            return predict_step(self.state_space(), mean, previous_action, reset)
+            model, cov = self._model(cov, previous_action)
+            return predict_step(model, mean, previous_action, reset, cov)
 
     # ------------------------------------------------------------------ offline
     def smooth(

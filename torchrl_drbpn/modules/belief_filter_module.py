@@ -31,7 +31,8 @@ class BeliefFilterModule(RecurrentBeliefModule):
     whole trajectories (last batch dimension = time) under ``set_recurrent_mode(True)``, its
     primer found by ``get_primers_from_module``.
 
-    The recurrent state is ``("recurrent", "mean")``, the filtered mean of the step before, and
+    The recurrent state is ``("recurrent", "mean")``, the filtered mean of the step before,
+    ``("recurrent", "cov")`` beside it if the filter propagates its covariance, and
     ``("recurrent", "age")``, the updates since the reset. One step at a time ``is_init`` starts
     from the learned initial belief. Over trajectories ``is_init & (age == 0)`` does; where
     ``is_init`` comes with an older age (the "next" stream of ``GAE(shifted=False)``, slices of a
@@ -43,10 +44,10 @@ class BeliefFilterModule(RecurrentBeliefModule):
 
     Keyword Args:
         in_key: the key of the observation, when every other keeps its name.
-        in_keys: the six entries read, in the order ``observation, observed, previous_action,
-            is_init, ("recurrent", "mean"), ("recurrent", "age")``: a list of the first four or
-            of all six, or a dict from these names to yours. None in the place of ``observed``:
-            everything arrives; of ``previous_action``: zeros.
+        in_keys: the entries read, in the order ``observation, observed, previous_action, is_init,
+            ("recurrent", "mean"), ("recurrent", "cov") where there is one, ("recurrent", "age")``:
+            a list of the first four or of all, or a dict from these names to yours. None in the
+            place of ``observed``: everything arrives; of ``previous_action``: zeros.
         out_key: the key of the features, when every other keeps its name.
         out_keys: the entries written, a list chosen from ``features``, ``("belief", "mean")``,
             ``("belief", "log_likelihood")`` (the default) and, computed only where asked for,
@@ -104,9 +105,12 @@ class BeliefFilterModule(RecurrentBeliefModule):
     ) -> None:
         if policy_input not in ("mean", "mean_cov"):
             raise ValueError(f"`policy_input` must be 'mean' or 'mean_cov', got {policy_input!r}.")
+        state: dict[NestedKey, tuple[int, ...]] = {("recurrent", "mean"): (filter.state_dim,)}
+        if filter.covariance == "propagated":
+            state["recurrent", "cov"] = (filter.state_dim, filter.state_dim)
         super().__init__(
-            filter, {("recurrent", "mean"): (filter.state_dim,)}, _DEFAULT, _OPTIONAL,
-            in_key, in_keys, out_key, out_keys, default_recurrent_mode,
+            filter, state, _DEFAULT, _OPTIONAL, in_key, in_keys, out_key, out_keys,
+            default_recurrent_mode,
         )  # fmt: skip
         self.policy_input, self.gate = policy_input, gate
 
@@ -118,11 +122,11 @@ class BeliefFilterModule(RecurrentBeliefModule):
 
     def _write_belief(self, tensordict: TensorDictBase) -> TensorDictBase:
         given = self._read(tensordict)
-        (mean,) = given.state
+        mean, cov = given.state[0], given.state[1] if len(given.state) > 1 else None
         readings = (given.previous_action, given.observation, given.observed, given.reset)
         want_cov = ("belief", "cov") in self._out or self.policy_input == "mean_cov"
         if not self.recurrent_mode:
-            out = self.filter.step(mean, None, *readings, return_cov=want_cov, gate=self.gate)
+            out = self.filter.step(mean, cov, *readings, return_cov=want_cov, gate=self.gate)
         elif self.gate is not None:
             raise ValueError(
                 f"`gate` is {self.gate:g}, and the mode is recurrent: a gate is for a trained "
@@ -130,14 +134,17 @@ class BeliefFilterModule(RecurrentBeliefModule):
                 "afterwards."
             )
         else:
-            # The sum of one step, or of none where there is no time at all.
-            start = mean[..., :1, :].sum(-2)
+            use, time = given.use_stored_state, given.reset.ndim - 1
+
+            def first(x: Tensor) -> Tensor:  # the sum of one step, or of none if there is no time
+                return x.narrow(time, 0, min(1, x.shape[time])).sum(time)
+
             out = self.filter(
-                start, None, *readings,
-                use_stored_state=given.use_stored_state, stored_mean=mean, return_cov=want_cov,
+                first(mean), None if cov is None else first(cov), *readings, use_stored_state=use,
+                stored_mean=mean, stored_cov=cov, return_cov=want_cov,
             )  # fmt: skip
-            before = torch.cat([mean[..., :1, :], out.mean[..., :-1, :]], -2)
-            mean = torch.where(given.use_stored_state.unsqueeze(-1), mean, before)
+            mean = _before(mean, out.mean, use)
+            cov = cov if cov is None or out.cov is None else _before(cov, out.cov, use)
         features = out.mean
         if self.policy_input == "mean_cov" and out.cov is not None:
             features = torch.cat([out.mean, tril_to_vector(out.cov)], -1)
@@ -149,14 +156,15 @@ class BeliefFilterModule(RecurrentBeliefModule):
         }
         if any(name not in results for name in self._out):
             emission, action = self.filter.emission, given.previous_action
-            predicted = self.filter.predict(mean, action, given.reset)
+            predicted = self.filter.predict(mean, action, given.reset, cov)
             results["belief", "observation"] = emission(out.mean, action)
             results["belief", "predicted_observation"] = emission(predicted.mean, action)
             if ("belief", "innovation_cov") in self._out:
                 results["belief", "innovation_cov"] = innovation(
                     predicted, given.observation, given.observed, emission.matrix, emission.cov()
                 ).cov
-        return self._write(tensordict, results, (out.mean, given.age + 1))
+        after = [out.mean] if cov is None or out.cov is None else [out.mean, out.cov]
+        return self._write(tensordict, results, (*after, given.age + 1))
 
     @property
     def gate(self) -> float | None:
@@ -174,3 +182,12 @@ class BeliefFilterModule(RecurrentBeliefModule):
         """Width of ``features``, for building the heads that read it."""
         state = self.filter.state_dim
         return state if self.policy_input == "mean" else state + state * (state + 1) // 2
+
+
+def _before(stored: Tensor, filtered: Tensor, use_stored: Tensor) -> Tensor:
+    """Return what each step of a sequence started from: what is stored, or the step before."""
+    time = use_stored.ndim - 1
+    steps = filtered.shape[time]
+    previous = (stored.narrow(time, 0, min(1, steps)), filtered.narrow(time, 0, max(0, steps - 1)))
+    use = use_stored.reshape(*use_stored.shape, *(1,) * (stored.ndim - use_stored.ndim))
+    return torch.where(use, stored, torch.cat(previous, time))

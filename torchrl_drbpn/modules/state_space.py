@@ -31,7 +31,8 @@ def check_dim(name: str, value: int) -> int:
     return int(value)
 
 
-def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raise ValueError unless ``value`` is one of ``choices``."""
     if value not in choices:
         raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {value!r}.")
 
@@ -61,7 +62,7 @@ class LearnedCovariance(nn.Module):
         name: str = "cov",
     ) -> None:
         super().__init__()
-        _check_choice(name, kind, ("diag", "full"))
+        check_choice(name, kind, ("diag", "full"))
         if not 0 < min_std < init_std:
             raise ValueError(
                 "`min_std` and `init_std` must satisfy 0 < min_std < init_std, got "
@@ -153,7 +154,7 @@ class GaussianTransition(nn.Module):
         super().__init__()
         self.state_dim = check_dim("state_dim", state_dim)
         self.action_dim = check_dim("action_dim", action_dim)
-        _check_choice("activation", activation, ("relu", "tanh"))
+        check_choice("activation", activation, ("relu", "tanh"))
         self.residual, self.activation = residual, activation
         self.cov_kind, self.init_std, self.min_std = cov, init_std, min_std
 
@@ -235,6 +236,31 @@ class GaussianTransition(nn.Module):
         predicted = self.mean_network()(mean, action)
         cov = self.cov(mean, action)
         return Belief(predicted, cov.expand(*predicted.shape, self.state_dim))
+
+
+def jacobian_of(
+    transition: nn.Module, mean: Tensor, action: Tensor, *, average: bool = False
+) -> Tensor:
+    """Return the derivative of a transition's mean by the mean, of each row or averaged over all.
+
+    Args:
+        transition: as in :func:`transition_functions`; in closed form for a GaussianTransition
+            whose ``forward`` is its own, by torch.func for another.
+        mean: shape ``(*batch, state)``.
+        action: shape ``(*batch, action)``.
+        average: whether the mean over the batch is wanted.
+
+    Returns:
+        Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
+    """
+    f, state = transition_functions(transition)[0], mean.shape[-1]
+    if isinstance(f, TransitionMLP):
+        return f.jacobian(mean, action, average=average)
+    rows = mean.reshape(-1, state), action.reshape(-1, action.shape[-1])
+    # As a batch of one row, which a module may rely on.
+    one = torch.func.jacrev(lambda m, a: f(m.unsqueeze(0), a.unsqueeze(0)).squeeze(0))
+    found = torch.func.vmap(one)(*rows)
+    return found.mean(0) if average else found.reshape(*mean.shape, state)
 
 
 def transition_functions(

@@ -1,0 +1,295 @@
+"""The propagated covariance: P = F cov F' + Q, in both forms of the filter, up to the keys.
+
+Specified here:
+
+- every form equals the row-deleting oracle whose covariance before is a constant of autograd, in
+  values and all gradients, to 1e-10; a sequence equals its steps; a NaN before a reset is harmless;
+- on a linear system the likelihood of a row is that of one joint Gaussian;
+- float32 stays positive definite over 10,000 steps, under a transition that expands too;
+- the closed-form Jacobian is autograd's, for every network, of each row and on average;
+- a filter computes it at its first call, then only where asked; it is saved with the filter;
+- the covariance is part of the recurrent state, and its absence is named.
+"""
+
+from __future__ import annotations
+
+import oracles
+import pytest
+import torch
+from filter_problems import SIZES, TOLERANCE, Problem, assert_equal, assert_same
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.modules import set_recurrent_mode
+
+from torchrl_drbpn import BeliefFilter, BeliefFilterModule, GaussianTransition
+from torchrl_drbpn.functional import (
+    Belief,
+    StateSpace,
+    TransitionMLP,
+    filter_sequence,
+    filter_step,
+    filtered_cov,
+)
+
+FORMS = ["pytorch", "step by step"]
+EVENTS = [
+    pytest.param({"resets": False}, id="one episode"),
+    pytest.param({"resets": True, "stored": True}, id="resets and stored states"),
+]
+
+
+# --- the filter -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("events", EVENTS)
+@pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("state", "obs"), SIZES)
+def test_every_form_equals_the_oracle_in_values_and_all_gradients(
+    state, obs, form, full_noise, events
+):
+    problem = Problem(state, obs, full_noise=full_noise, propagated=True, **events)
+    assert_same(problem, problem.library(form), problem.oracle())
+    # Not asked for, the covariance is there all the same: it is the state. It has no gradient.
+    out = problem.run(form, **problem.stored())
+    assert not out.cov.requires_grad
+    assert_equal(out.cov, problem.oracle()[1])
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("state", "obs"), SIZES)
+def test_stepping_through_time_equals_the_whole_sequence(state, obs, form):
+    problem = Problem(state, obs, propagated=True)
+    whole = problem.library(form)
+    (mean, *rest), cov, rows = problem.arguments(), problem.start_cov, []
+    for t in range(problem.reset.shape[1]):
+        step = (mean, *(x[:, t] for x in rest))
+        out = problem.run(form, *step, function=filter_step, cov=cov, return_cov=True)
+        mean, cov = out.mean, out.cov
+        rows.append(out)
+    stepped = tuple(torch.stack(part, 1) for part in zip(*rows, strict=True))
+    assert_same(problem, stepped, whole)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_nan_before_a_reset_and_what_is_not_asked_for_change_nothing(form):
+    problem = Problem(3, 5, stored=True, propagated=True)
+    problem.reset[:, 0] = problem.reset[:, 3] = True
+    clean = problem.library(form)
+    gradients = problem.gradients(clean)
+    problem.start_cov = problem.start_cov * torch.nan
+    unused = ~problem.use_stored | problem.reset
+    problem.stored_cov = problem.stored_cov.masked_fill(unused[..., None, None], torch.nan)
+    for a, b in zip(problem.library(form), clean, strict=True):
+        assert torch.equal(a, b)
+    for name, gradient in problem.gradients(problem.library(form)).items():
+        assert torch.equal(gradient, gradients[name]), name
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_while_nothing_arrives_the_covariance_grows_by_the_transition(form):
+    problem = Problem(3, 5, resets=False, propagated=True)
+    problem.observed = torch.zeros_like(problem.observed)
+    out, cov = problem.library(form), problem.start_cov
+    for t in range(problem.reset.shape[1]):
+        cov = problem.jacobian @ cov @ problem.jacobian.mT + problem.covs()[0]
+        assert_equal(out.cov[:, t], cov)
+    assert torch.equal(out.log_likelihood, torch.zeros_like(out.log_likelihood))
+
+
+def linear(system: oracles.LinearSystem) -> StateSpace:
+    weight = torch.cat([system.dynamics, system.control], 1)
+    f = TransitionMLP((weight,), (torch.zeros_like(system.initial_mean),), False, "relu")
+    return StateSpace(
+        f, system.transition_cov, system.matrix, system.noise.diagonal(), system.action_matrix,
+        system.bias, system.initial_mean, system.initial_cov, system.dynamics,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["auto", "pytorch"])
+@pytest.mark.parametrize(("state", "obs"), SIZES)
+def test_on_a_linear_system_the_likelihood_is_that_of_one_joint_gaussian(state, obs, form):
+    system = oracles.random_system(state, obs)
+    data = oracles.simulate(system, 3, 8)
+    data.reset[:, 0] = True
+    start = data.start_mean, torch.zeros(3, state, state).double()
+    inputs = (data.previous_action, data.observation, data.observed, data.reset)
+    out = filter_sequence(linear(system), start[0], *inputs, cov=start[1], form=form)
+    for row in range(3):
+        expected = oracles.joint_log_likelihood(system, data, row)
+        assert_equal(out.log_likelihood[row].sum(), expected)
+
+
+@pytest.mark.parametrize("expands", [0.9, 1.05])
+@pytest.mark.parametrize("obs", [3, 6], ids=["innovation", "information"])
+def test_float32_stays_positive_definite_over_ten_thousand_steps(obs, expands):
+    g = torch.Generator().manual_seed(0)
+    system = oracles.random_system(4, obs).to(torch.float32)
+    model = linear(system)
+    model.transition_jacobian = expands * system.dynamics / 0.9
+    model.transition_cov = torch.full((4,), 1e-6)  # the floor of a GaussianTransition
+    model.emission_cov = torch.full((obs,), 1e-4)
+    seen = torch.rand(1, 10_000, obs, generator=g) < 0.5
+    seen[:, 3000:6000] = False
+    seen[:, :, 0] = False
+    none = torch.zeros(1, 10_000, 2)
+    first = torch.zeros(1, 10_000, dtype=torch.bool)
+    start = torch.zeros(1, 4), torch.eye(4).unsqueeze(0)
+    out = filter_sequence(model, start[0], none, torch.zeros(seen.shape), seen, first, cov=start[1])
+    assert torch.equal(out.cov, out.cov.mT)
+    assert torch.linalg.cholesky_ex(out.cov).info.eq(0).all()
+    assert out.mean.isfinite().all()
+    # The same step by step, where each step begins from what float32 holds.
+    step, cov = (start[0], none[:, 0], torch.zeros(1, obs)), start[1]
+    for t in range(0, 10_000, 5):
+        cov = filter_step(model, *step, seen[:, t], first[:, t], cov=cov).cov
+        assert not torch.linalg.cholesky_ex(cov).info.any()
+
+
+def test_what_a_propagated_covariance_needs_is_named():
+    problem = Problem(3, 5, stored=True, propagated=True)
+    with pytest.raises(ValueError, match="`cov` is None, but this model propagates"):
+        problem.run("auto", cov=None)
+    missing = {**problem.stored(), "stored_cov": None}
+    with pytest.raises(ValueError, match="`stored_cov` is None, but this model propagates"):
+        problem.run("auto", **missing)
+    with pytest.raises(ValueError, match=r"`cov` must be float64 of shape .*= \(3, 3, 3\)"):
+        problem.run("auto", cov=problem.start_cov[:2])
+    with pytest.raises(ValueError, match="depends on the whole past"):
+        filtered_cov(problem.model(), problem.observed, problem.reset)
+    problem.jacobian = torch.eye(2).double()
+    with pytest.raises(ValueError, match=r"`transition_jacobian` must have shape \(3, 3\)"):
+        problem.model()
+
+
+# --- the Jacobian ---------------------------------------------------------------------------------
+
+
+class Own(nn.Module):
+    """A transition that is no GaussianTransition: s + .1 tanh(A s) a_1, with a constant Q."""
+
+    def __init__(self, state: int) -> None:
+        super().__init__()
+        self.matrix = nn.Parameter(torch.randn(state, state))
+
+    def forward(self, mean: Tensor, action: Tensor) -> Belief:
+        moved = mean + 0.1 * (mean @ self.matrix.mT).tanh() * action[..., :1]
+        return Belief(moved, 0.1 * torch.eye(mean.shape[-1]).to(mean).expand(*mean.shape, -1))
+
+
+@pytest.mark.parametrize("residual", [False, True])
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize("hidden", [(), (7,), (7, 5), (7, 5, 6)], ids=len)
+def test_the_closed_form_jacobian_is_that_of_autograd(hidden, activation, residual):
+    torch.manual_seed(0)
+    transition = GaussianTransition(
+        3, 2, hidden_sizes=hidden, activation=activation, residual=residual, dtype=torch.float64
+    )
+    f = transition.mean_network()
+    mean, action = torch.randn(4, 6, 3).double(), torch.randn(4, 6, 2).double()
+    rows = torch.func.vmap(torch.func.vmap(torch.func.jacrev(f)))(mean, action)
+    assert_equal(f.jacobian(mean, action), rows, 1e-12)
+    assert_equal(f.jacobian(mean, action, average=True), rows.mean((0, 1)), 1e-12)
+
+
+def inputs(batch: int = 4, time: int = 6, obs: int = 5) -> tuple[Tensor, ...]:
+    torch.manual_seed(1)
+    seen = torch.rand(batch, time, obs) < 0.6
+    reset = torch.zeros(batch, time, dtype=torch.bool)
+    reset[:, 0] = reset[0, 3] = True
+    return torch.randn(batch, time, 2), torch.randn(batch, time, obs), seen, reset
+
+
+def test_a_fresh_filter_sets_its_jacobian_once_and_it_is_saved_with_it():
+    torch.manual_seed(0)
+    filter = BeliefFilter(5, 2, 3, covariance="propagated")
+    start = torch.zeros(4, 3), torch.zeros(4, 3, 3)
+    first = filter(*start, *inputs())
+    jacobian = filter.mean_jacobian.clone()
+    assert jacobian.isfinite().all()
+    with torch.no_grad():
+        filter.transition.layers[0].weight.mul_(3)
+    filter(*start, *inputs())
+    assert torch.equal(filter.mean_jacobian, jacobian)
+
+    other = BeliefFilter(5, 2, 3, covariance="propagated")
+    other.load_state_dict(filter.state_dict())
+    again = other(*start, *inputs())
+    assert torch.equal(other.mean_jacobian, jacobian)
+    assert not torch.equal(again.mean, first.mean)
+    mean, action = torch.randn(9, 3), torch.randn(9, 2)
+    other.refresh_jacobian(mean, action)
+    expected = other.transition.mean_network().jacobian(mean, action).mean(0)
+    torch.testing.assert_close(other.mean_jacobian, expected)
+    other.reset_parameters()
+    other(*start, *inputs())
+    assert not torch.equal(other.mean_jacobian, expected)
+    with pytest.raises(ValueError, match="covariance='propagated'"):
+        BeliefFilter(5, 2).refresh_jacobian(mean, action)
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["ours", "another"])
+@pytest.mark.parametrize("jacobian", ["mean", "row"])
+def test_a_filter_propagates_by_the_jacobian_of_its_transition(jacobian, own):
+    torch.manual_seed(0)
+    options = {"covariance": "propagated", "jacobian": jacobian}
+    filter = BeliefFilter(5, 2, 3, transition=Own(3) if own else None, **options).double()
+    f = lambda m, a: filter.transition(m, a)[0]  # noqa: E731
+    data = [x.double() if x.is_floating_point() else x for x in inputs()]
+    mean, action = torch.randn(9, 3).double(), torch.randn(9, 2).double()
+    filter.refresh_jacobian(mean, action)
+    rows = torch.func.vmap(torch.func.jacrev(f))
+    F = rows(mean, action).mean(0) if jacobian == "mean" else torch.func.jacrev(f)
+    model, start = filter.state_space(), (mean[:4], torch.eye(3).double().expand(4, 3, 3))
+    Q = filter.transition(mean[0], action[0])[1]
+    truth = oracles.filter_sequence(
+        observation=data[1], observed=data[2], previous_action=data[0], reset=data[3],
+        start_mean=start[0], start_cov=start[1], initial_mean=model.initial_mean,
+        initial_cov=model.full_initial_cov(), transition=f, transition_cov=Q,
+        matrix=model.emission_matrix, noise=model.full_emission_cov(),
+        action_matrix=model.action_matrix, bias=model.emission_offset, jacobian=F,
+    )  # fmt: skip
+    out = filter(*start, *data, return_cov=True)
+    for a, b in zip(out, (truth.mean, truth.cov, truth.log_likelihood), strict=True):
+        assert_equal(a, b, TOLERANCE)
+
+
+# --- keys -----------------------------------------------------------------------------------------
+
+
+def test_the_covariance_is_part_of_the_recurrent_state():
+    torch.manual_seed(0)
+    module = BeliefFilterModule(BeliefFilter(5, 2, 3, covariance="propagated"))
+    assert ("recurrent", "cov") in module.in_keys
+    assert ("next", "recurrent", "cov") in module.out_keys
+    primer = module.make_tensordict_primer()
+    assert primer.primers["recurrent", "cov"].shape == (3, 3)
+    action, x, seen, reset = inputs()
+    none = torch.zeros(4, 3)
+    state = TensorDict({"mean": none, "cov": none.unsqueeze(-1) * none.unsqueeze(-2)}, [4])
+    state["age"] = torch.zeros(4, 1).long()
+    steps = []
+    for t in range(6):
+        state["age"][reset[:, t]] = 0  # as the primer does
+        step = TensorDict(
+            {
+                "previous_action": action[:, t], "observation": x[:, t], "observed": seen[:, t],
+                "is_init": reset[:, t, None], "recurrent": state,
+            },
+            [4],
+        )  # fmt: skip
+        steps.append(module(step))
+        state = steps[-1]["next", "recurrent"].clone()
+    data = torch.stack(steps, 1)
+    data["is_init"][2, 4] = True  # where two slices were joined: the stored belief is taken
+    data["recurrent", "cov"][2, 4] *= 2
+    with set_recurrent_mode(True):
+        out = module(data.clone())
+    for key in (("belief", "log_likelihood"), "features", ("next", "recurrent", "cov")):
+        torch.testing.assert_close(out[key][:2], data[key][:2], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(out[key][2, :4], data[key][2, :4], atol=1e-5, rtol=1e-5)
+    assert not torch.allclose(out["features"][2, 4], data["features"][2, 4])
+    del data["recurrent", "cov"]
+    for mode in (False, True):
+        with set_recurrent_mode(mode), pytest.raises(KeyError, match=r"recurrent', 'cov'.*not in"):
+            module(data)
