@@ -192,6 +192,13 @@ def _filter(model: StateSpace, given: Sequence, return_cov: bool, form: Form) ->
     if form not in ("auto", "pytorch", "native"):
         raise ValueError(f"`form` must be 'auto', 'pytorch' or 'native', got {form!r}.")
     F = model.transition_jacobian
+    needed = (("stored_cov", given[7], given[4] is not None), ("cov", given[8], True))
+    for name, value, always in needed if F is not None else ():
+        if always and value is None:
+            raise ValueError(
+                f"`{name}` is None, but this model propagates its covariance: pass the filtered "
+                "covariance beside the mean."
+            )
     if F is None:
         given = (*given[:7], None, None)
     *batch, time = given[3].shape

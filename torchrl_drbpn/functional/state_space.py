@@ -225,15 +225,6 @@ class StateSpace:
             ("cov", cov, own, " state, state", (*start, state, state)),
             ("stored_cov", stored_cov, own, " state, state", (*steps, state, state)),
         )
-        if self.transition_jacobian is not None:
-            for name, value, needed in (
-                ("cov", cov, True), ("stored_cov", stored_cov, use_stored_state is not None),
-            ):  # fmt: skip
-                if needed and value is None:
-                    raise ValueError(
-                        f"`{name}` is None, but this model propagates its covariance: pass the "
-                        "filtered covariance beside the mean."
-                    )
         for name, value, dtype, word, shape in wanted:
             if value is None or (value.shape == shape and value.dtype == dtype):
                 continue

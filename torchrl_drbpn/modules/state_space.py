@@ -16,6 +16,7 @@ from torchrl_drbpn.functional import (
     full_cov,
     inverse_softplus,
     positive_std,
+    row_jacobian,
 )
 
 __all__ = ["GaussianTransition", "LinearGaussianEmission"]
@@ -256,11 +257,8 @@ def jacobian_of(
     f, state = transition_functions(transition)[0], mean.shape[-1]
     if isinstance(f, TransitionMLP):
         return f.jacobian(mean, action, average=average)
-    rows = mean.reshape(-1, state), action.reshape(-1, action.shape[-1])
-    # As a batch of one row, which a module may rely on.
-    one = torch.func.jacrev(lambda m, a: f(m.unsqueeze(0), a.unsqueeze(0)).squeeze(0))
-    found = torch.func.vmap(one)(*rows)
-    return found.mean(0) if average else found.reshape(*mean.shape, state)
+    rows = row_jacobian(f, mean, action)
+    return rows.reshape(-1, state, state).mean(0) if average else rows
 
 
 def transition_functions(
