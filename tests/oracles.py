@@ -15,7 +15,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -326,6 +328,24 @@ def joint_log_likelihood(system: LinearSystem, data: Data, row: int) -> Tensor:
     return torch.distributions.MultivariateNormal(
         torch.cat(means)[keep], cov[keep][:, keep]
     ).log_prob(x)
+
+
+def statsmodels(system: LinearSystem, data: Data) -> Any:
+    """Bind the first row to statsmodels' filter and smoother, or skip the test."""
+    statespace = pytest.importorskip("statsmodels.tsa.statespace.kalman_smoother")
+    x, observed, action = data.observation[0], data.observed[0], data.previous_action[0]
+    theirs = statespace.KalmanSmoother(k_endog=system.obs_dim, k_states=system.state_dim)
+    theirs.bind(torch.where(observed, x, torch.nan).numpy())
+    moves = action[1:] @ system.control.T  # theirs lead from a step to the next
+    last = torch.zeros(1, system.state_dim, dtype=torch.float64)
+    for name, value in (
+        ("design", system.matrix), ("obs_cov", system.noise), ("transition", system.dynamics),
+        ("obs_intercept", system.offset(action).T), ("selection", torch.eye(system.state_dim)),
+        ("state_intercept", torch.cat([moves, last]).T), ("state_cov", system.transition_cov),
+    ):  # fmt: skip
+        theirs[name] = value.numpy()
+    theirs.initialize_known(system.initial_mean.numpy(), system.initial_cov.numpy())
+    return theirs
 
 
 # Scalar random walk, A = H = Q = R = 1, covariance propagated. The predicted variance obeys

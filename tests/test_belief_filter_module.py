@@ -48,6 +48,7 @@ class TestContractOfTheInformationForm(TestContract):
     """State smaller than obs; the covariance in the features."""
 
     test_it_runs_in_batched_environments = None  # once is enough
+    test_compiled_without_a_graph_break_equals_eager = None  # the other two do
 
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
         belief = make_any_filter(obs, action, dtype, state=3)

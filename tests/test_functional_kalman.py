@@ -231,23 +231,11 @@ def test_step_likelihoods_sum_to_one_joint_gaussian_when_the_covariance_is_propa
 
 
 def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagated():
-    statespace = pytest.importorskip("statsmodels.tsa.statespace.kalman_filter")
     system = oracles.random_system(3, 5, seed=4, full_noise=True)
     data = oracles.simulate(system, batch=1, time=30, seed=4)
-    x, observed, action = data.observation[0], data.observed[0], data.previous_action[0]
-    theirs = statespace.KalmanFilter(k_endog=5, k_states=3)
-    theirs.bind(torch.where(observed, x, torch.nan).numpy())
-    moves = action[1:] @ system.control.T  # theirs lead from a step to the next
-    for name, value in (
-        ("design", system.matrix), ("obs_cov", system.noise), ("transition", system.dynamics),
-        ("obs_intercept", system.offset(action).T), ("selection", torch.eye(3)),
-        ("state_intercept", torch.cat([moves, torch.zeros(1, 3)]).double().T),
-        ("state_cov", system.transition_cov),
-    ):  # fmt: skip
-        theirs[name] = value.numpy()
-    theirs.initialize_known(system.initial_mean.numpy(), system.initial_cov.numpy())
-    truth = theirs.filter()
-    steps = propagated(system, x, observed, action, Belief(system.initial_mean, system.initial_cov))
+    truth = oracles.statsmodels(system, data).filter()
+    rows = data.observation[0], data.observed[0], data.previous_action[0]
+    steps = propagated(system, *rows, Belief(system.initial_mean, system.initial_cov))
     for t, (_, filtered, ll) in enumerate(steps):
         assert_equal(filtered.mean, torch.from_numpy(truth.filtered_state[:, t]), 1e-8)
         assert_equal(filtered.cov, torch.from_numpy(truth.filtered_state_cov[:, :, t]), 1e-8)

@@ -105,18 +105,8 @@ def test_it_is_the_joint_gaussian_conditioned_on_all_readings_with_its_gradients
 
 
 def test_it_equals_statsmodels():
-    statespace = pytest.importorskip("statsmodels.tsa.statespace.kalman_smoother")
     system, data = linear(30, batch=1, reset_rate=0.0, seed=4)
-    x, observed, action = data.observation[0], data.observed[0], data.previous_action[0]
-    theirs = statespace.KalmanSmoother(k_endog=4, k_states=3)
-    theirs.bind(torch.where(observed, x, torch.nan).numpy())
-    theirs["design"], theirs["obs_cov"] = system.matrix.numpy(), system.noise.numpy()
-    theirs["obs_intercept"] = system.offset(action).T.numpy()
-    theirs["transition"], theirs["selection"] = system.dynamics.numpy(), torch.eye(3).numpy()
-    moves = torch.cat([action[1:] @ system.control.T, torch.zeros(1, 3).double()])
-    theirs["state_intercept"], theirs["state_cov"] = moves.T.numpy(), system.transition_cov.numpy()
-    theirs.initialize_known(system.initial_mean.numpy(), system.initial_cov.numpy())
-    truth = theirs.smooth()
+    truth = oracles.statsmodels(system, data).smooth()
     mean, cov = smooth_sequence(space(system), *inputs(data))
     assert_equal(mean[0], torch.from_numpy(truth.smoothed_state.T.copy()), 1e-8)
     assert_equal(cov[0].movedim(0, -1), torch.from_numpy(truth.smoothed_state_cov), 1e-8)

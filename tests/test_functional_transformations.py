@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 
 import pytest
@@ -81,31 +82,15 @@ def test_exported_it_is_the_same(obs):
 
 @SIZES
 def test_fake_and_meta_tensors_give_shapes(obs):
-    with FakeTensorMode():
-        problem = Problem.__new__(Problem)
-        problem.__dict__.update(_empty(3, obs, "cpu"))
-        assert tuple(problem.library("auto").mean.shape) == (2, 4, 3)
-    problem = Problem.__new__(Problem)
-    problem.__dict__.update(_empty(3, obs, "meta"))
-    out = problem.library("auto")
-    assert out.mean.is_meta
-    assert out.log_likelihood.shape == (2, 4)
-
-
-def _empty(state: int, obs: int, device: str) -> dict:
-    shapes = {
-        "observation": (2, 4, obs), "previous_action": (2, 4, 2), "start_mean": (2, state),
-        "transition_root": (state, state), "noise": (obs,), "matrix": (obs, state),
-        "action_matrix": (obs, 2), "bias": (obs,), "initial_mean": (state,),
-        "initial_root": (state, state), "weight0": (state, state + 2), "bias0": (state,),
-    }  # fmt: skip
-    return {
-        "leaves": {k: torch.empty(v, device=device) for k, v in shapes.items()},
-        "observed": torch.empty(2, 4, obs, dtype=torch.bool, device=device),
-        "reset": torch.empty(2, 4, dtype=torch.bool, device=device),
-        "use_stored": None, "layers": 1, "full_noise": False, "residual": True,
-        "activation": "tanh",
-    }  # fmt: skip
+    mode = FakeTensorMode()
+    for moved in (mode.from_tensor, lambda x: x.to("meta")):
+        problem = Problem(3, obs, batch=2, time=4)
+        problem.leaves = {name: moved(leaf.detach()) for name, leaf in problem.leaves.items()}
+        problem.observed, problem.reset = moved(problem.observed), moved(problem.reset)
+        with mode if moved == mode.from_tensor else contextlib.nullcontext():
+            mean, _, ll = problem.library("auto")
+        assert (tuple(mean.shape), tuple(ll.shape)) == ((2, 4, 3), (2, 4))
+    assert mean.is_meta
 
 
 @SIZES

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from contracts import ACTION, OBS, BeliefModuleContract, StaircaseEnv, with_belief_entries
+from contracts import ACTION, OBS, BeliefModuleContract
 from particle_tools import HIDDEN, LATENT, OPTIONAL, K, make_filter, make_frames
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn import BeliefModelLoss, ParticleFilterModule
+from torchrl_drbpn import ParticleFilterModule
 
 
 class TestContract(BeliefModuleContract):
@@ -68,26 +67,3 @@ def test_optional_entries_are_written_where_asked_for(over_time):
 def test_a_wrong_size_is_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_filter(**kwargs)
-
-
-def test_the_model_is_learned_by_the_loss_that_learns_the_belief_filter():
-    # a staircase observed through a mask: the bound rises
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        module = ParticleFilterModule(make_filter(num_particles=3))
-        env = with_belief_entries(
-            TransformedEnv(StaircaseEnv(horizon=20), Compose()), module.make_tensordict_primer()
-        )
-        data = env.rollout(16, break_when_any_done=False)
-        data["observation"] *= 0.01
-        data["next", "observation"] *= 0.01
-        loss, optimizer = BeliefModelLoss(), torch.optim.Adam(module.parameters(), lr=1e-2)
-        history = []
-        for _ in range(40):
-            with set_recurrent_mode(True):
-                value = loss(module(data.select(*module.in_keys, "observed")))["loss_model"]
-            optimizer.zero_grad()
-            value.backward()
-            optimizer.step()
-            history.append(value.item())
-    assert history[-1] < history[0] - 0.5
