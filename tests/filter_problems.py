@@ -16,6 +16,7 @@ from torchrl_drbpn.functional import (
     StateSpace,
     TransitionMLP,
     filter_sequence,
+    native,
     native_status,
 )
 
@@ -137,6 +138,13 @@ class Problem:
     def stored(self) -> dict[str, Any]:
         names = {"stored_mean": self.leaves.get("stored_mean"), "stored_cov": self.stored_cov}
         return {"use_stored_state": self.use_stored, **names}
+
+    def operator_arguments(self) -> list[Any]:
+        """Return what the native operator takes."""
+        mean, action, x, seen, reset = self.arguments()
+        use, stored, stored_cov = self.stored().values()
+        belief = (use, stored, mean, stored_cov, self.start_cov)
+        return [x, seen, action, reset, *belief, *native.operator_arguments(self.model())]
 
     def run(
         self, form: str, *arguments: Tensor, function: Any = filter_sequence, **kwargs: Any

@@ -31,38 +31,42 @@ operator = torch.ops.torchrl_drbpn.filter_rows
         (1, 1, 1, 2), (4, 6, 2, 5), (17, 3, 5, 105), (3, 11, 17, 27), (33, 2, 8, 9), (2, 2, 64, 70),
     ],
 )  # fmt: skip
-def test_every_size_equals_the_pytorch_form(batch, time, state, obs):
+@pytest.mark.parametrize("propagated", [False, True], ids=["constant", "propagated"])
+def test_every_size_equals_the_pytorch_form(batch, time, state, obs, propagated):
     problem = Problem(
-        state, obs, batch=batch, time=time, hidden=(8, 5), activation="relu", stored=time > 2
-    )
+        state, obs, batch=batch, time=time, hidden=(8, 5), activation="relu", stored=time > 2,
+        propagated=propagated,
+    )  # fmt: skip
     assert_same(problem, problem.library("native"), problem.library("pytorch"), 1e-9)
 
 
-def row(problem: Problem) -> tuple:
-    """The operator's arguments."""
-    mean, action, x, seen, reset = problem.arguments()
-    return (
-        x, seen, action, reset, *list(problem.stored().values())[:2], mean,
-        *native.operator_arguments(problem.model()),
-    )  # fmt: skip
-
-
 @built
-@pytest.mark.parametrize("obs", [3, 5], ids=["innovation", "information"])
+@pytest.mark.parametrize(
+    ("obs", "propagated"),
+    [(3, False), (5, False), (5, True)],
+    ids=["obs", "state", "F"],
+)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_it_passes_the_checks_of_torch_library(obs, dtype):
-    arguments = row(Problem(3, obs, stored=True, dtype=dtype))
+def test_it_passes_the_checks_of_torch_library(obs, dtype, propagated):
+    problem = Problem(3, obs, stored=True, dtype=dtype, propagated=propagated)
+    arguments = tuple(problem.operator_arguments())
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
     found = torch.library.opcheck(operator, arguments, test_utils=checks)
     assert set(found.values()) == {"SUCCESS"}
 
 
 @built
-def test_vmap_over_it_equals_a_loop():
-    arguments = [x.detach() if isinstance(x, torch.Tensor) else x for x in row(Problem(3, 5))]
+@pytest.mark.parametrize("propagated", [False, True])
+def test_vmap_over_it_equals_a_loop(propagated):
+    arguments = Problem(3, 5, propagated=propagated).operator_arguments()
+    arguments = [x.detach() if isinstance(x, torch.Tensor) else x for x in arguments]
     observation = torch.stack([arguments[0], 2 * arguments[0]], -1)
-    networks = torch.stack([arguments[14], -arguments[14]])
-    run = lambda x, f: operator(x, *arguments[1:14], f, *arguments[15:])[:2]  # noqa: E731
+    networks = torch.stack([arguments[16], -arguments[16]])
+
+    def run(x, f):
+        mean, ll, _, cov = operator(x, *arguments[1:16], f, *arguments[17:])
+        return mean, ll, cov
+
     found = torch.vmap(run, in_dims=(-1, 0))(observation, networks)
     for i in range(2):
         expected = run(observation[..., i], networks[i])
@@ -74,7 +78,7 @@ def test_vmap_over_it_equals_a_loop():
 def test_fake_tensors_and_traces_meet_an_operator():
     problem = Problem(3, 5)
     with FakeTensorMode(allow_non_fake_inputs=True):
-        out = operator(*row(Problem(3, 5)))
+        out = operator(*Problem(3, 5).operator_arguments())
     assert [tuple(x.shape) for x in out[:2]] == [(3, 6, 3), (3, 6)]
     model, (mean, *rest) = problem.model(), problem.arguments()
     with torch.no_grad():
@@ -93,6 +97,7 @@ def test_what_it_does_not_take_it_names():
     assert reason(model, torch.zeros(2, device="meta").double()) == "it runs on the CPU"
     assert "TransitionMLP" in reason(replace(model, transition=lambda m, _: m))
     assert "constant" in reason(replace(model, transition_cov=lambda m, _: m))
+    assert "diagonal" in reason(Problem(2, 3, propagated=True, full_noise=True).model())
     assert "nothing" in reason(model, torch.zeros(0, 3).double())
     assert reason(Problem(2, 65, full_noise=True).model()) == "obs is 65, more than 64"
     assert reason(Problem(2, 65).model()) is None  # 2 x 2 is factorised
@@ -117,10 +122,10 @@ def test_what_it_does_not_take_it_names():
     assert found == ["torch.func transforms PyTorch's operations"]
 
 
-@pytest.mark.parametrize("place", range(15))
+@pytest.mark.parametrize("place", range(18))
 @pytest.mark.parametrize("spoil", ["size", "dtype", "dimension", "device"])
 def test_a_wrong_tensor_never_reaches_c(place, spoil):
-    arguments = list(row(Problem(3, 5, stored=True)))
+    arguments = Problem(3, 5, stored=True, propagated=True).operator_arguments()
     x = arguments[place]
     spoilt = {
         "size": x[..., :-1], "dtype": x.to(torch.int32), "dimension": x.unsqueeze(0),
@@ -133,18 +138,26 @@ def test_a_wrong_tensor_never_reaches_c(place, spoil):
         operator(*arguments)
 
 
+@pytest.mark.parametrize("place", [4, 5, 7, 8])
+def test_a_belief_that_is_not_whole_never_reaches_c(place):
+    arguments = Problem(3, 5, stored=True, propagated=True).operator_arguments()
+    arguments[place] = None
+    with pytest.raises(ValueError, match=r"beside `stored`|come with `cov`"):
+        operator(*arguments)
+
+
 @pytest.mark.parametrize("widths", [[], [5], [5, 4], [3], [0, 3], [-5, 3], [5, 3, 3]], ids=str)
 def test_widths_that_are_not_the_networks_never_reach_c(widths):
-    arguments = list(row(Problem(3, 5)))
-    arguments[15] = widths
+    arguments = Problem(3, 5).operator_arguments()
+    arguments[18] = widths
     with pytest.raises(ValueError, match=r"must be|last width|no size"):
         operator(*arguments)
 
 
 @built
 def test_a_tape_of_another_call_never_reaches_c():
-    arguments = row(Problem(3, 5))
-    mean, ll, tape = operator(*arguments)
+    arguments = Problem(3, 5).operator_arguments()
+    mean, ll, tape, _ = operator(*arguments)
     backward = torch.ops.torchrl_drbpn.filter_rows_backward
     for wrong in ((mean, ll, tape[:-1]), (mean[:1], ll, tape), (mean, ll.float(), tape)):
         with pytest.raises(ValueError, match=r"`tape` must be|like the outputs"):

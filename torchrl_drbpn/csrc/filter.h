@@ -6,6 +6,7 @@
  *   memory.h       sizes and where everything lies
  *   innovation.h   the gain by inv(S), obs x obs, and back
  *   information.h  the gain by C = inv(inv(P) + H' W H), state x state, and back
+ *   propagated.h   the same with P = F Sigma F' + Q, its recursion ahead of the means
  *
  * The two forms differ in how z = inv(S) e and the gain of a row come about, and in what the
  * covariances receive. What is here serves both: the transition, the innovation
@@ -18,6 +19,7 @@
  *
  * Nothing is checked here: functional/native.py checks every size before it calls.
  */
+#include <float.h>
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -94,14 +96,14 @@ void NAME(forward)(const int64_t *dims, void **p) {
     long batch = s->batch, time = s->time;
 
     for (long i = 1; i <= s->layers; i++) {
-        const given *weight = p[16 + 2 * i], *bias = p[17 + 2 * i];
+        const given *weight = p[20 + 2 * i], *bias = p[21 + 2 * i];
         take_in(s->width[i - 1], s->width[i], weight, 1, s->width[i - 1], a.weight_t[i], s->W[i]);
         take_in(1, s->width[i], bias, 0, 1, a.bias[i], s->W[i]);
     }
     take_in(m, n, H, 1, m, a.sensor_t, N);
     take_in(s->action, n, B, 1, s->action, a.sensor_t + m * N, N);
     take_in(1, n, d, 0, 1, a.offset, N);
-    if (s->information) prepare_information(s, &a, &tape, p + 7, noise, H, observed, reset);
+    if (s->information) prepare_information(s, &a, &tape, p + 7, noise, H, observed, reset, p);
     else prepare_innovation(s, &a, &tape, p + 7, noise, observed, reset);
 
     for (long t = 0; t < time; t++) {
@@ -241,12 +243,12 @@ void NAME(backward)(const int64_t *dims, void **p) {
     narrow(n, w.wide, p[19]);
 
     vec *sum = (vec *)w.sum;
-    for (long g = 0; g < s->groups; g++) {
+    for (long g = 0; g < s->groups && !s->propagated; g++) {
         vec half = *(vec *)(w.half + g * LANES);
         const vec *I = (const vec *)tape.inverse + g * s->entries;
         for (long i = 0; i < s->entries; i++) sum[i] += half * I[i];
     }
-    if (s->information) finish_information(s, &w, &tape, H, g_ll, observed, p + 14);
+    if (s->information) finish_information(s, &w, &tape, H, g_ll, observed, reset, p + 14);
     else finish_innovation(s, &w, &tape, H, p + 4, p + 14);
     narrow(s->full_noise ? n * n : n, w.g_noise, p[16]);
     narrow(n * m, w.g_H, p[17]);

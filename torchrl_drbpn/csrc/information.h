@@ -3,6 +3,10 @@
  * The caller gives the inverses of Q and initial_cov in their places (`prior`); of C, symmetric,
  * the lower triangle is kept. Forward the mean moves by C H' W e; back, e receives W H C g of what
  * the mean receives, g. Likelihoods are without log|P|, which the caller knows.
+ *
+ * Where the covariance is propagated C is the next state of its recursion and P differs from row to
+ * row: propagated.h runs it ahead, keeps inv(P) of each row beside C, and log|P| is in the
+ * likelihood; Q and initial_cov themselves stand in `prior`.
  */
 
 /* C = inv(inv(P) + sum_i w_i h_i h_i') of two groups of LANES rows, w_i = observed_i / r_i. */
@@ -32,10 +36,12 @@ static void gather(const Sizes *s, const Ahead *a, long group, const uint8_t *ob
     }
 }
 
+#include "propagated.h"
+
 /* Ahead of the loop: the products h_i h_i' and the inverses of all rows. */
 static void prepare_information(const Sizes *s, const Ahead *a, const Tape *tape,
                                 void *const *prior, const given *noise, const given *H,
-                                const uint8_t *observed, const uint8_t *reset) {
+                                const uint8_t *observed, const uint8_t *reset, void **p) {
     long n = s->obs, m = s->state, N = s->N, S = s->S;
     real *to = a->products;
     for (int k = 0; k < 2; k++) pack(m, m, prior[k], m, 1, a->prior[k], S);
@@ -45,7 +51,8 @@ static void prepare_information(const Sizes *s, const Ahead *a, const Tape *tape
     for (long i = 0; i < m; i++)
         for (long j = 0; j <= i; j++)
             for (long k = 0; k < n; k++) *to++ = a->sensor_t[i * N + k] * a->sensor_t[j * N + k];
-    for (long g = 0; g < s->groups; g += 2)
+    if (s->propagated) propagate(s, a, tape, observed, reset, p[4], p[18], p[19], p[20], p[21]);
+    else for (long g = 0; g < s->groups; g += 2)
         gather(s, a, g, observed, reset, tape->inverse, a->log_det);
 }
 
@@ -63,7 +70,11 @@ static void gain_information(const Sizes *s, const Ahead *a, const Tape *tape, l
     product(batch, S, n, z, N, 1, a->sensor, S, a->pull, S, 1, 0);
     solve(1, m, S, row, row + batch, tape->inverse, a->pull, a->error_lanes, tape->shift);
     product(batch, N, m, shift, S, 1, a->sensor_t, N, a->fit, N, 1, 0);
-    product_of_two(batch, reset + t, s->time, S, m, shift, S, a->prior, a->pull, S, 0);
+    const real *pull = a->pull; /* inv(P) shift */
+    if (s->propagated) {
+        pull = tape->lifted + row * S;
+        solve(1, m, S, row, row + batch, tape->prior, shift, a->error_lanes, tape->lifted);
+    } else product_of_two(batch, reset + t, s->time, S, m, shift, S, a->prior, a->pull, S, 0);
     for (long b = 0; b < batch; b++) {
         long at = b * s->time + t;
         real *e = a->error + b * N, *moved = shift + b * S, sum = a->log_det[row + b];
@@ -74,7 +85,7 @@ static void gain_information(const Sizes *s, const Ahead *a, const Tape *tape, l
             z[b * N + i] = left * a->inverse_noise[i];
             sum += z[b * N + i] * left + (seen ? a->log_noise[i] : 0);
         }
-        for (long i = 0; i < m; i++) sum += moved[i] * a->pull[b * S + i];
+        for (long i = 0; i < m; i++) sum += moved[i] * pull[b * S + i];
         ll[at] = -0.5 * sum;
         for (long i = 0; i < m; i++) a->mean[b * S + i] += moved[i];
         narrow(m, a->mean + b * S, mean + at * m);
@@ -99,6 +110,8 @@ static void by_gain_information(const Sizes *s, const Back *w, const Tape *tape,
     real *by = w->error + row * N;
     solve(1, m, S, row, row + batch, tape->inverse, w->filtered + row * S, w->lanes, w->gained);
     product(batch, N, m, w->gained + row * S, S, 1, w->sensor_t, N, by, N, 1, 0);
+    if (s->propagated)
+        solve(1, m, S, row, row + batch, tape->prior, w->gained + row * S, w->lanes, w->outer);
     for (long b = 0; b < batch; b++)
         for (long i = 0; i < n; i++)
             by[b * N + i] *= observed[(b * s->time + t) * n + i] ? w->inverse_noise[i] : 0;
@@ -113,6 +126,12 @@ static void by_information(const Sizes *s, Back *w, const Tape *tape, long r,
     for (long i = 0; i < s->obs; i++)
         w->g_noise[i] += z[i] * left[i] - (observed[i] ? half * w->inverse_noise[i] : 0);
     for (long i = m; i < S; i++) p[i] = 0;
+    if (s->propagated) { /* by P: (inv(P) p + half inv(P) shift) (inv(P) shift)', and more below */
+        for (long i = 0; i < m; i++) outer[i] += half * tape->lifted[r * S + i];
+        for (long i = m; i < S; i++) outer[i] = 0;
+        w->half[r] = half;
+        return;
+    }
     for (long i = 0; i < S; i++) outer[i] = -(p[i] + half * shift[i]);
     if (!again) {
         w->half[r] = half;
@@ -135,6 +154,10 @@ static void predicted_information(const Sizes *s, const Back *w, const Tape *tap
     long m = s->state, S = s->S, batch = s->batch;
     const real *p = w->gained + t * batch * S, *shift = tape->shift + t * batch * S;
     real *sum = w->step, *to = w->pull;
+    if (s->propagated) {
+        predicted_propagated(s, w, tape, t, reset);
+        return;
+    }
     for (long b = 0; b < batch; b++)
         for (long i = 0; i < m; i++)
             sum[b * S + i] = p[b * S + i] + (g_ll ? g_ll[b * s->time + t] : 0) * shift[b * S + i];
@@ -181,7 +204,8 @@ static const real *spread(const Sizes *s, const Back *w, const Tape *tape, const
 
 /* By H, R and the two inv(P), once every row is there; g_H and g_noise hold their first parts. */
 static void finish_information(const Sizes *s, Back *w, const Tape *tape, const given *H,
-                               const real *g_ll, const uint8_t *observed, void *const *g_prior) {
+                               const real *g_ll, const uint8_t *observed, const uint8_t *reset,
+                               void *const *g_prior) {
     real *g_noise = w->g_noise, *g_H = w->g_H;
     long n = s->obs, m = s->state, N = s->N, S = s->S;
     product(n, S, s->rows, tape->z, 1, N, w->gained, S, w->wide, S, 1, 0);
@@ -201,14 +225,17 @@ static void finish_information(const Sizes *s, Back *w, const Tape *tape, const 
             }
         g_noise[i] += 0.5 * square * w->inverse_noise[i];
     }
-    product(m, S, s->rows, w->outer, 1, S, tape->shift, S, w->by_prior[0], S, 1, 0);
-    const vec *sum = (const vec *)w->sum;
-    for (long i = 0; i < m; i++)
-        for (long j = 0; j <= i; j++) {
-            real total = over_lanes(*sum++);
-            w->by_prior[0][i * S + j] -= total;
-            if (i > j) w->by_prior[0][j * S + i] -= total;
-        }
+    const vec *sums[2] = {(const vec *)w->sum, (const vec *)w->sum_first};
+    const real *right = s->propagated ? tape->lifted : tape->shift;
+    product(m, S, s->rows, w->outer, 1, S, right, S, w->by_prior[0], S, 1, 0);
+    if (s->propagated) sum_propagated(s, w, tape, reset);
+    for (int k = 0; k <= s->propagated; k++)
+        for (long i = 0; i < m; i++)
+            for (long j = 0; j <= i; j++) {
+                real total = over_lanes(*sums[k]++);
+                w->by_prior[k][i * S + j] -= total;
+                if (i > j) w->by_prior[k][j * S + i] -= total;
+            }
     for (int k = 0; k < 2; k++) {
         real *to = g_prior[k];
         for (long i = 0; i < m; i++)

@@ -8,16 +8,16 @@
 
 typedef struct {
     long batch, time, obs, state, action, layers, residual, relu, full_noise, start_stride,
-        information;
+        information, propagated;
     long width[MAX_LAYERS + 1], W[MAX_LAYERS + 1]; /* of layer outputs; 0: (state, action) */
     long N, S, J, rows, groups, half; /* half: entries of a lower triangle, state x state */
     long entries;                     /* kept of an inverse */
 } Sizes;
 
 static Sizes read_sizes(const int64_t *d) {
-    Sizes z = {d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9], d[10]};
+    Sizes z = {d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8], d[9], d[10], d[11]};
     z.width[0] = z.state + z.action;
-    for (long i = 1; i <= z.layers; i++) z.width[i] = d[10 + i];
+    for (long i = 1; i <= z.layers; i++) z.width[i] = d[11 + i];
     for (long i = 0; i <= z.layers; i++) z.W[i] = padded(z.width[i]);
     z.N = padded(z.obs), z.S = padded(z.state), z.J = z.W[0];
     z.rows = z.batch * z.time, z.groups = (z.rows + LANES - 1) / LANES;
@@ -35,7 +35,8 @@ static real *take(Memory *m, long count) {
 }
 
 typedef struct { /* what the reverse pass reads, all but inverse as [rows][padded] */
-    real *input, *predicted, *hidden[MAX_LAYERS], *z, *inverse, *cross[2], *cross_t[2], *shift;
+    real *input, *predicted, *hidden[MAX_LAYERS], *z, *inverse, *cross[2], *cross_t[2], *shift,
+        *prior, *lifted;
 } Tape;
 
 static Tape lay_tape(const Sizes *s, Memory *m) {
@@ -44,6 +45,10 @@ static Tape lay_tape(const Sizes *s, Memory *m) {
     for (long i = 1; i < s->layers; i++) t.hidden[i] = take(m, s->rows * s->W[i]);
     t.z = take(m, s->rows * s->N);
     t.inverse = take(m, s->groups * s->entries * LANES);
+    if (s->propagated) {
+        t.prior = take(m, s->groups * s->half * LANES);
+        t.lifted = take(m, s->rows * s->S);
+    }
     if (s->information) t.shift = take(m, s->rows * s->S);
     else for (int k = 0; k < 2; k++) {
         t.cross[k] = take(m, s->state * s->N);
@@ -55,7 +60,8 @@ static Tape lay_tape(const Sizes *s, Memory *m) {
 typedef struct { /* scratch of forward */
     real *weight_t[MAX_LAYERS + 1], *bias[MAX_LAYERS + 1], *sensor_t, *offset, *cov[2], *factor,
         *lower, *error, *error_lanes, *log_det, *mean, *step, *sensor, *inverse_noise, *log_noise,
-        *products, *weight, *gathered, *square, *pull, *fit, *prior[2];
+        *products, *weight, *gathered, *square, *pull, *fit, *prior[2], *jacobian, *sigma, *before,
+        *moved, *kept;
 } Ahead;
 
 static Ahead lay_ahead(const Sizes *s, Memory *m) {
@@ -73,6 +79,12 @@ static Ahead lay_ahead(const Sizes *s, Memory *m) {
         a.gathered = take(m, s->half * 2 * LANES), a.square = take(m, n * n * LANES);
         a.pull = take(m, s->batch * s->S), a.fit = take(m, s->batch * s->N);
     } else a.cov[0] = take(m, s->obs * s->N), a.cov[1] = take(m, s->obs * s->N);
+    if (s->propagated) {
+        a.jacobian = take(m, n * n);
+        a.sigma = take(m, (s->batch + LANES - 1) / LANES * s->half * LANES);
+        a.before = take(m, n * n * LANES), a.moved = take(m, n * n * LANES);
+        a.kept = take(m, s->half * LANES);
+    }
     a.prior[0] = take(m, s->state * s->S), a.prior[1] = take(m, s->state * s->S);
     a.factor = take(m, n * n * LANES), a.lower = take(m, n * n * LANES);
     a.error = take(m, s->batch * s->N), a.error_lanes = take(m, n * LANES);
@@ -92,7 +104,7 @@ typedef struct { /* scratch of backward */
     real *weight[MAX_LAYERS + 1], *layer[MAX_LAYERS + 1], *sensor, *noise_prior[2], *filtered,
         *error, *left, *half, *lanes, *sum, *carry, *by_predicted, *by_input, *cross[2], *cov[2],
         *square, *wide, *sensor_t, *inverse_noise, *gained, *prior[2],
-        *by_prior[2], *outer, *pull, *step, *spread, *g_noise, *g_H, *g_initial;
+        *by_prior[2], *outer, *full[2], *sum_first, *pull, *step, *spread, *g_noise, *g_H, *g_initial;
 } Back;
 
 static Back lay_back(const Sizes *s, Memory *m) {
@@ -124,6 +136,11 @@ static Back lay_back(const Sizes *s, Memory *m) {
             b.cross[k] = take(m, s->state * s->N), b.cov[k] = take(m, s->obs * s->N);
         }
         b.square = take(m, s->obs * s->N);
+    }
+    if (s->propagated) {
+        b.full[0] = take(m, s->state * s->state * LANES);
+        b.full[1] = take(m, s->state * s->state * LANES);
+        b.sum_first = take(m, s->half * LANES);
     }
     b.wide = take(m, widest * widest);
     b.g_noise = take(m, s->full_noise ? s->obs * s->obs : s->obs);

@@ -28,6 +28,7 @@ _KINDS = {torch.float32: "float", torch.float64: "double"}
 _WIDTHS = {"AVX512": "avx512", "AVX2": "avx2"}
 _MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
 _MAX_LAYERS = 15
+_TENSORS = 18  # arguments of the operator before the network's widths
 
 
 @functools.cache
@@ -67,9 +68,10 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     f, Q = model.transition, model.transition_cov
     if not isinstance(f, TransitionMLP) or not isinstance(Q, Tensor):
         return "it takes a TransitionMLP with a constant transition_cov"
-    if model.transition_jacobian is not None:
-        return "it takes a constant covariance"
-    own = (Q, *list(vars(model).values())[2:8], *f.weights, *f.biases)
+    F = model.transition_jacobian
+    if callable(F) or (F is not None and model.emission_cov.ndim == 2):
+        return "it propagates a covariance by one Jacobian, with a diagonal emission_cov"
+    own = (Q, *list(vars(model).values())[2:], *f.weights, *f.biases)
     given = [x for x in (*own, *tensors) if x is not None]
     if torch.compiler.is_compiling():
         return "torch.compile and torch.export trace PyTorch's operations"
@@ -91,7 +93,8 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
             return "the dtypes differ"
     if given[0].dtype not in _KINDS:
         return f"there is none for {given[0].dtype}"
-    size, name = (model.state_dim, "state") if model.information_form else (model.obs_dim, "obs")
+    by_state = model.information_form or F is not None
+    size, name = (model.state_dim, "state") if by_state else (model.obs_dim, "obs")
     if size > _MAX_SIZE:
         return f"{name} is {size}, more than {_MAX_SIZE}"
     if len(f.weights) > _MAX_LAYERS:
@@ -105,15 +108,16 @@ def filter_rows(
     model: StateSpace, *sequence: Tensor | None
 ) -> tuple[Tensor, Tensor | None, Tensor]:
     """Filter what :func:`unsupported_reason` has nothing against, as ``run_in_pytorch`` does."""
-    out = torch.ops.torchrl_drbpn.filter_rows(*sequence[:7], *operator_arguments(model))
-    return out[0], None, out[1]
+    mean, ll, _, cov = torch.ops.torchrl_drbpn.filter_rows(*sequence, *operator_arguments(model))
+    return mean, None if model.transition_jacobian is None else cov, ll
 
 
 def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
     """Return a model as the operator takes it.
 
     That is Q, P_0, R, H, B, d, m_0, the network's weights and biases in one piece (autograd is slow
-    on lists of tensors), the widths of its layers, whether it is residual, and whether it has tanh.
+    on lists of tensors), F or None, the widths of its layers, whether it is residual, and whether
+    it has tanh.
     """
     f = model.transition
     assert isinstance(f, TransitionMLP)  # the rule saw to it; for the type checker
@@ -121,8 +125,8 @@ def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
     return (
         model.constant_cov(), model.full_initial_cov(), model.emission_cov, model.emission_matrix,
         model.action_matrix, model.emission_offset, model.initial_mean,
-        torch.cat([x.reshape(-1) for x in layers]), [len(bias) for bias in f.biases],
-        f.residual, f.activation == "tanh",
+        torch.cat([x.reshape(-1) for x in layers]), model.transition_jacobian,
+        [len(bias) for bias in f.biases], f.residual, f.activation == "tanh",
     )  # fmt: skip
 
 
@@ -141,8 +145,8 @@ class _Call:
     """One call with the operator's arguments, checked: its sizes, and how much memory it needs."""
 
     def __init__(self, arguments: Sequence[Any]) -> None:
-        observation, _, action, _, use_stored, stored, start, *_ = arguments
-        R, (layers, residual, tanh) = arguments[9], arguments[15:]
+        observation, _, action, _, use_stored, stored, start, stored_cov, cov, *_ = arguments
+        R, (F, layers, residual, tanh) = arguments[11], arguments[_TENSORS - 1 :]
         if observation.ndim != 3 or action.ndim != 3 or start.ndim != 2:
             raise ValueError(
                 "`observation` and `action` must be (batch, time, n), `start` (batch, n)."
@@ -150,12 +154,14 @@ class _Call:
         batch, time, obs = observation.shape
         state, actions = start.shape[1], action.shape[2]
         self.widths = [state + actions, *layers]
-        self.information = R.ndim == 1 and obs > state
+        self.propagated = F is not None
+        self.information = R.ndim == 1 and (obs > state or self.propagated)
         shapes: tuple[tuple[int, ...], ...] = (
             (batch, time, obs), (batch, time, obs), (batch, time, actions), (batch, time),
-            (batch, time), (batch, time, state), (batch, state), (state, state), (state, state),
-            (obs,) * min(2, max(1, R.ndim)), (obs, state), (obs, actions), (obs,), (state,),
-            (sum(n * (m + 1) for m, n in itertools.pairwise(self.widths)),),
+            (batch, time), (batch, time, state), (batch, state), (batch, time, state, state),
+            (batch, state, state), (state, state), (state, state), (obs,) * min(2, max(1, R.ndim)),
+            (obs, state), (obs, actions), (obs,), (state,),
+            (sum(n * (m + 1) for m, n in itertools.pairwise(self.widths)),), (state, state),
         )  # fmt: skip
         own = observation.dtype
         for i, (x, shape) in enumerate(zip(arguments, shapes, strict=False)):
@@ -168,6 +174,9 @@ class _Call:
         whole = bool(layers) and layers[-1] == state and (use_stored is None) == (stored is None)
         if own not in _KINDS or not whole:
             raise ValueError("float32 or float64, last width state, `use_stored` beside `stored`.")
+        needed = [cov is not None, stored_cov is not None or use_stored is None, R.ndim == 1]
+        if self.propagated and not all(needed):
+            raise ValueError("`F` must come with `cov`, `stored_cov` beside `stored`, R diagonal.")
         size = state if self.information else obs
         smallest = min(*self.widths, *(n for shape in shapes for n in shape))
         if size > _MAX_SIZE or len(layers) > _MAX_LAYERS or smallest < 1:
@@ -177,9 +186,10 @@ class _Call:
             raise RuntimeError(f"the native filter cannot run: {library}.")
         numbers = [
             batch, time, obs, state, actions, len(layers), residual, not tanh, R.ndim == 2, state,
-            self.information, *layers,
+            self.information, self.propagated, *layers,
         ]  # fmt: skip
         self.library, self.kind, self.mean_shape = library, _KINDS[own], (batch, time, state)
+        self.cov_shape = (batch, time, state, state) if self.propagated else (0,)
         self.sizes, counts = (ctypes.c_int64 * len(numbers))(*numbers), (ctypes.c_int64 * 3)()
         getattr(library, f"sizes_{self.kind}")(self.sizes, counts)
         self.tape, self.scratch, self.scratch_back = counts
@@ -205,33 +215,37 @@ def _doubles(count: int) -> Tensor:
 
 
 def _dense(arguments: Sequence[Any]) -> list[Any]:
-    return [x.contiguous() if isinstance(x, Tensor) else x for x in arguments[:15]]
+    return [x.contiguous() if isinstance(x, Tensor) else x for x in arguments[:_TENSORS]]
 
 
 def _inverses(call: _Call, covs: Sequence[Tensor]) -> tuple[list[Tensor], Tensor | None]:
-    """Return what C takes for Q and P_0, and log|Q|, log|P_0| in the information form."""
+    """Return what C takes for Q and P_0: the inverses where there are two, and their log|.|."""
     if not call.information:
         return list(covs), None
+    if call.propagated:
+        return [cov.double() for cov in covs], None
     factor, _ = torch.linalg.cholesky_ex(torch.stack(list(covs)).double())
     inverse = torch.cholesky_inverse(factor)
     return list(inverse), 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 # ------------------------------------------------------------------ the operator
-def _forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     call, dense = _Call(arguments), _dense(arguments)
-    x, observed, reset, network = dense[0], dense[1], dense[3], dense[14]
+    x, observed, reset, (network, F) = dense[0], dense[1], dense[3], dense[-2:]
     mean, ll = x.new_empty(call.mean_shape), x.new_empty(reset.shape, dtype=torch.float64)
+    cov = x.new_empty(call.cov_shape)
     tape, scratch = _doubles(call.tape), _doubles(call.scratch)
-    priors, log_det = _inverses(call, dense[7:9])
+    priors, log_det = _inverses(call, dense[9:11])
     call.run(
-        "forward", *dense[:7], *priors, *dense[9:14], mean, ll, tape, scratch,
-        *call.layers(network),
+        "forward", *dense[:7], *priors, *dense[11:16], mean, ll, tape, scratch, F, dense[8],
+        dense[7], cov, *call.layers(network),
     )  # fmt: skip
     if log_det is not None:
         ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
+    if call.information:
         ll = torch.where(observed.any(-1), ll, 0.0)
-    return mean, ll.to(x.dtype), tape
+    return mean, ll.to(x.dtype), tape, cov
 
 
 def _backward(
@@ -239,7 +253,7 @@ def _backward(
 ) -> list[Tensor]:
     """Return the gradients by observation, action, stored mean, start and the model's tensors."""
     call, dense = _Call(arguments), _dense(arguments)
-    x, observed, action, reset, use_stored, stored, start, *model = dense
+    x, observed, action, reset, use_stored, stored, start, _, _, *model, _ = dense
     if tape.shape != (call.tape,) or tape.dtype != torch.float64 or not tape.is_contiguous():
         raise ValueError("`tape` must be what filter_rows returned for the same inputs.")
     for by, shape in ((by_mean, call.mean_shape), (by_ll, reset.shape)):
@@ -248,7 +262,7 @@ def _backward(
     by_mean = None if by_mean is None else by_mean.contiguous()
     by_ll = None if by_ll is None else by_ll.double().contiguous()
     priors, log_det = _inverses(call, model[:2])
-    if log_det is not None and by_ll is not None:
+    if call.information and by_ll is not None:
         by_ll = torch.where(observed.any(-1), by_ll, 0.0)
     by_inputs = [None if v is None else torch.empty_like(v) for v in (x, action, stored, start)]
     by_model = [torch.empty_like(v) for v in (*priors, *model[2:])]
@@ -263,18 +277,19 @@ def _backward(
             by = -prior @ by_model[k] @ prior
             if by_ll is not None:
                 by -= 0.5 * torch.where(chosen, by_ll, 0.0).sum() * prior
-            by_model[k] = by.to(x.dtype)
+            by_model[k] = by
+    by_model[:2] = [by.to(x.dtype) for by in by_model[:2]]
     return [v for v in by_inputs if v is not None] + by_model
 
 
-def _forward_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _forward_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     x, call = arguments[0], _Call(arguments)
-    mean = x.new_empty(call.mean_shape)
-    return mean, x.new_empty(mean.shape[:2]), x.new_empty(call.tape, dtype=torch.float64)
+    mean, tape = x.new_empty(call.mean_shape), x.new_empty(call.tape, dtype=torch.float64)
+    return mean, x.new_empty(mean.shape[:2]), tape, x.new_empty(call.cov_shape)
 
 
 def _backward_fake(*arguments: Any) -> list[Tensor]:
-    x, _, action, _, _, stored, start, *model = arguments[3:18]
+    x, _, action, _, _, stored, start, _, _, *model, _ = arguments[3 : 3 + _TENSORS]
     return [torch.empty_like(v) for v in (x, action, stored, start, *model) if v is not None]
 
 
@@ -282,14 +297,14 @@ class _Filter(torch.autograd.Function):
     """The derivative; one that is differentiated again runs in PyTorch."""
 
     @staticmethod
-    def forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return torch.ops.torchrl_drbpn.filter_rows_forward(*arguments)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.rest = inputs[15:]
-        ctx.save_for_backward(output[2], *inputs[:15])
-        ctx.mark_non_differentiable(output[2])
+        ctx.rest = inputs[_TENSORS:]
+        ctx.save_for_backward(output[2], *inputs[:_TENSORS])
+        ctx.mark_non_differentiable(*output[2:])
         ctx.set_materialize_grads(False)
 
     @staticmethod
@@ -302,12 +317,12 @@ class _Filter(torch.autograd.Function):
                 )
             )
             sequence = (x, None, action, None, None, stored[0] if stored else None, start)
-            return (*sequence, Q, P0, R, H, B, d, m0, network, None, None, None)
+            return (*sequence, None, None, Q, P0, R, H, B, d, m0, network, *(None,) * 4)
         from torchrl_drbpn.functional.filtering import run_in_pytorch  # which imports this file
 
-        Q, P0, R, H, B, d, m0, network = saved[7:]
-        model = StateSpace(_unpacked(network, Q, B, *ctx.rest), Q, H, R, B, d, m0, P0)
-        outputs = run_in_pytorch(model, *saved[:7])[::2]
+        Q, P0, R, H, B, d, m0, network, F = saved[9:]
+        model = StateSpace(_unpacked(network, Q, B, *ctx.rest), Q, H, R, B, d, m0, P0, F)
+        outputs = run_in_pytorch(model, *saved[:9])[::2]
         pairs = [(o, g) for o, g in zip(outputs, by_outputs[:2], strict=True) if g is not None]
         values, weights = zip(*pairs, strict=True)
         wanted = [x for x in saved if x is not None and x.requires_grad]
@@ -329,20 +344,21 @@ def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor
         )
         for i in range(info.batch_size)
     ]
-    return tuple(torch.stack(parts) for parts in zip(*runs, strict=True)), (0, 0, 0)
+    return tuple(torch.stack(parts) for parts in zip(*runs, strict=True)), (0, 0, 0, 0)
 
 
 _ARGUMENTS = (
     "Tensor observation, Tensor observed, Tensor action, Tensor reset, Tensor? use_stored, "
-    "Tensor? stored, Tensor start, Tensor Q, Tensor P0, Tensor R, Tensor H, Tensor B, Tensor d, "
-    "Tensor m0, Tensor network, int[] widths, bool residual, bool tanh"
+    "Tensor? stored, Tensor start, Tensor? stored_cov, Tensor? cov, Tensor Q, Tensor P0, Tensor R, "
+    "Tensor H, Tensor B, Tensor d, Tensor m0, Tensor network, Tensor? F, int[] widths, "
+    "bool residual, bool tanh"
 )
 _LIBRARY: Any = torch.library.Library("torchrl_drbpn", "DEF")  # type: ignore[no-untyped-call]
 # The second is the first without its derivative. (torch.library.register_autograd would make the
 # first alone do, at several times the cost of a call: it reads the schema in Python every time.)
 for _name, _more, _out, _run, _fake in (
-    ("filter_rows", "", "(Tensor, Tensor, Tensor)", _forward, _forward_fake),
-    ("filter_rows_forward", "", "(Tensor, Tensor, Tensor)", _forward, _forward_fake),
+    ("filter_rows", "", "(Tensor, Tensor, Tensor, Tensor)", _forward, _forward_fake),
+    ("filter_rows_forward", "", "(Tensor, Tensor, Tensor, Tensor)", _forward, _forward_fake),
     (
         "filter_rows_backward", "Tensor? by_mean, Tensor? by_log_likelihood, Tensor tape, ",
         "Tensor[]", _backward, _backward_fake,
