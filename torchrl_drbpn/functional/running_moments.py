@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_drbpn.functional.gaussian import check_observed
+
 __all__ = ["RunningMoments", "masked_moments", "merge_moments", "spread", "winsorize"]
 
 # Its square is still a float64.
@@ -63,11 +65,7 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMome
     """
     if observed is None:
         observed = torch.ones_like(value, dtype=torch.bool)
-    if observed.dtype is not torch.bool or observed.shape != value.shape:
-        raise ValueError(
-            f"`observed` must be bool of the shape of `value` {tuple(value.shape)}, one entry for "
-            f"every component, got {observed.dtype} {tuple(observed.shape)}."
-        )
+    check_observed(value, observed)
     weight = observed.double()
     count = weight.sum(0)
     share = weight / count.clamp_min(1.0)
