@@ -1,7 +1,7 @@
-"""docs/extending.md: a transform, a belief and a loss of one's own, from files elsewhere.
+"""A transform, a belief, a loss and a robot of one's own, from files elsewhere, as the pages say.
 
-Each command of the page trains, from any directory and by the command line alone. The duties of
-every belief module hold for the page's example.
+Each command of the pages trains, from any directory and by the command line alone. The duties of
+every belief module hold for the pages' example.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ pytest.importorskip("hydra")
 from recipe_tools import ROOT, read_table  # isort: skip
 
 EXAMPLE = ROOT / "docs" / "extending"
-sys.path.insert(0, str(EXAMPLE))
+sys.path[:0] = [str(EXAMPLE), str(ROOT / "docs" / "environment")]
 
 from test_moving_average import TestMovingAverage  # noqa: E402, F401  (collected here)
 
-PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^PYTHONPATH=.* recipes/ppo_drbpn\.py .*$", PAGE, re.MULTILINE)
+PAGES = "".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+                for name in ("extending", "environment", "nan"))  # fmt: skip
+COMMANDS = re.findall(r"^PYTHONPATH=.* recipes/ppo_drbpn\.py .*$", PAGES, re.MULTILINE)
 
 
-@pytest.mark.parametrize("line", COMMANDS, ids=["transform", "belief", "loss"])
+@pytest.mark.parametrize("line", COMMANDS, ids=["transform", "belief", "loss", "robot", "nan"])
 def test_a_command_of_the_page_trains_from_anywhere(line: str, tmp_path: Path) -> None:
     from evaluation.trained import load_trained_agent
 
@@ -53,6 +54,9 @@ def test_a_command_of_the_page_trains_from_anywhere(line: str, tmp_path: Path) -
     if "cautious" in line:
         assert trained.settings.loss.kl_coeff == 2
         assert list((tmp_path / "run" / "logs").rglob("*loss_kl*"))
+    if "from_nan" in line:
+        assert 0.2 < float(row["missing_ratio"]) < 0.4
+        assert trained.columns()["trained_on"] == "ObservedFromNaN"
     env = trained.environments()(0)
     names = [type(t).__name__ for t in env.transform]
     assert ("Drift" in names) == ("drift" in line)
