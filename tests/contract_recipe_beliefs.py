@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import pytest
 import small_agents
 import torch
 from belief_frames import BeliefFrames
-from contract_environments import ACTION, OBS, StaircaseEnv, saved
+from contract_environments import ACTION, OBS, StaircaseEnv
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
 from torchrl.modules import set_recurrent_mode
@@ -125,15 +124,6 @@ class RecipeBeliefContract(BeliefFrames):
                 assert out[key].shape == rollout[key].shape, key
                 assert out[key].dtype == rollout[key].dtype, key
 
-    def test_its_primers_are_found_and_its_state_is_written_for_the_next_step(self):
-        module = self.make_belief().module
-        step = self.one_by_one(module, self.frames(1), None)[:, 0]
-        for key, spec in self.primers(module).items():
-            following = ("next", key) if isinstance(key, str) else ("next", *key)
-            assert following in module.out_keys
-            assert step[following].shape == (3, *spec.shape), key
-            assert step[following].dtype == spec.dtype, key
-
     def test_what_was_read_is_left_as_it_was(self):
         module = self.make_belief().module
         rollout = self.one_by_one(module, self.frames(), None).select(*module.in_keys)
@@ -144,18 +134,6 @@ class RecipeBeliefContract(BeliefFrames):
             assert torch.equal(rollout[key], before[key]), key
 
     # --- steps and sequences
-    def test_step_by_step_equals_the_whole_sequence(self):
-        belief = self.make_belief()
-        frames = self.frames(9)
-        expected = self.one_by_one(belief.module, frames, None)
-        self.assert_same(belief.module, self.sequence(belief, frames), expected)
-
-    def test_a_reset_inside_a_row_equals_two_rows(self):
-        belief = self.make_belief()
-        frames = self.frames(8)
-        frames["is_init"][:, 4] = True
-        parts = [self.sequence(belief, part) for part in (frames[:, :4], frames[:, 4:])]
-        self.assert_same(belief.module, self.sequence(belief, frames), torch.cat(parts, 1))
 
     def test_a_rollout_is_what_sequences_cut_from_it_give(self):
         belief = self.learned_belief()
@@ -277,24 +255,6 @@ class RecipeBeliefContract(BeliefFrames):
         assert torch.equal(torch.get_rng_state(), state)
 
     # --- files and copies
-    def test_the_state_survives_a_file(self):
-        first, second = self.make_belief(), self.make_belief()
-        with torch.no_grad():
-            for parameter in first.module.parameters():
-                parameter += 0.05
-        second.module.load_state_dict(saved(first.module.state_dict()))
-        expected = self.sequence(first, self.frames())["features"]
-        assert torch.equal(self.sequence(second, self.frames())["features"], expected)
-
-    def test_a_deepcopy_computes_the_same_and_shares_nothing(self):
-        first = self.make_belief().module
-        second = copy.deepcopy(first)
-        frames = self.one_by_one(first, self.frames(), None).select(*first.in_keys)
-        with set_recurrent_mode(True), torch.no_grad():
-            expected = first(frames.clone())["features"].clone()
-            for parameter in first.parameters():
-                parameter.fill_(0.3)
-            assert torch.equal(second(frames.clone())["features"], expected)
 
     # --- what the recipe asks for besides
     def test_what_it_tells_of_the_sensors_comes_from_the_same_belief(self):

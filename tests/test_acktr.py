@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 
 pytest.importorskip("hydra")
-from recipe_tools import assembled, differences, make_config, read_table, resume, run  # isort: skip
+from recipe_tools import assembled, differences, read_table, resume, run  # isort: skip
 
 from algorithms.acktr import ACKTR
 from ppo_drbpn import collect, train_rollout
@@ -42,15 +42,6 @@ def rollout_of(*overrides: str) -> tuple[Training, TensorDictBase]:
     data = collect(training)
     add_advantages(data, training.agent, training.gae)
     return training, data
-
-
-def test_the_settings_are_those_of_the_paper() -> None:
-    config = make_config("algo=acktr", "belief=none")
-    assert (config.advantage.gamma, config.advantage.lmbda) == (0.99, 0.97)
-    assert config.collector.num_envs * config.collector.steps_per_env == 2560
-    assert config.algo.desired_kl == 0.002
-    # what is given on the command line wins over what the entry sets in other groups
-    assert make_config("algo=acktr", "advantage.lmbda=0.9").advantage.lmbda == 0.9
 
 
 def test_a_run_leaves_its_numbers_and_no_column_of_ppo(acktr: Path) -> None:

@@ -227,15 +227,6 @@ def test_nis_by_class_are_those_of_the_rows_of_a_class_alone() -> None:
 # Intervals -------------------------------------------------------------------------------------
 
 
-def test_an_interval_over_episodes_is_that_of_a_mean_over_independent_episodes() -> None:
-    values = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ones = torch.ones(400, dtype=torch.float64)
-    mean, low, high = Resampling(400, 4000, seed=1).ratio("x", values, ones).values()
-    half = 1.96 * values.std().item() / 20
-    assert mean == pytest.approx(values.mean().item())
-    assert (low, high) == pytest.approx((mean - half, mean + half), abs=0.15 * half)
-
-
 def test_an_interval_over_few_episodes_holds_the_mean_as_often_as_it_claims() -> None:
     """Plain percentiles hold it in .91 of the cases; .007 is a standard error of 1000 trials."""
     generator = torch.Generator().manual_seed(0)

@@ -11,8 +11,6 @@ from __future__ import annotations
 import dataclasses
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +26,12 @@ from analysis.figures import draw_evaluation
 from evaluation import episodes as episodes_room
 from evaluation import table as table_room
 from evaluation.conditions import default_conditions, removed_sensors
-from evaluation.episodes import StoppingPolicy, over_episodes, run_episodes
+from evaluation.episodes import StoppingPolicy, over_episodes
 from evaluation.folders import find_folders, override
 from evaluation.sensor_choice import kept_sensors
 from evaluation.table import evaluate_tasks
 from evaluation.trained import TrainedAgent, load_trained_agent
 from omegaconf import DictConfig
-from recipe_tools import ROOT
 from training.errors import UserError
 from training.run_folder import read_config, write_config
 
@@ -239,30 +236,6 @@ def test_more_episodes_only_add(
     assert len(set(returns)) > len(returns) / 2  # no episode is another one again
 
 
-def test_an_episode_sees_the_same_to_the_bit_among_more(agent: TrainedAgent) -> None:
-    condition = parse("mcar:0.5", agent.settings)
-    seen: dict[int, list[torch.Tensor]] = {}
-    for episodes in (1, 4):
-        rows = seen[episodes] = []
-
-        def watch(_: slice, data: Any, running: torch.Tensor, rows: list[Any] = rows) -> None:
-            if running[0]:
-                keys = ("observation", "observed", "action", ("next", "reward"), "features")
-                rows.append(torch.cat([data[key][0].double() for key in keys]))
-
-        done = run_episodes(
-            agent.agent.policy,
-            agent.environments(condition.missingness),
-            episodes=episodes,
-            mode="sampled",
-            seed=5,
-            watch=watch,
-        )
-        assert done
-    assert len(seen[1]) == len(seen[4]) > 1
-    assert torch.equal(torch.stack(seen[1]), torch.stack(seen[4]))
-
-
 def test_the_global_generator_is_left_alone_and_stopping_gives_nothing(agent: TrainedAgent) -> None:
     before = torch.get_rng_state()
     how = {"episodes": 2, "mode": "mean", "seed": 5}
@@ -411,19 +384,6 @@ def test_a_folder_is_found_whatever_its_name_holds(tmp_path: Path, name: str) ->
     # What is printed for a shell comes back from shell and Hydra as it was.
     (word,) = shlex.split(override("run", folder))
     assert configured("evaluate", word)["run"] == str(folder)
-
-
-def test_the_command_line_takes_what_it_prints(drbpn: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "eta=0.5, [s 0]"
-    shutil.copytree(drbpn, folder)
-    script = shlex.join([sys.executable, str(ROOT / "recipes" / "evaluate.py")])
-    words = "'points=[none:0]' episodes=1 figures=false processes=1"
-    done = subprocess.run(
-        ["bash", "-c", f"{script} {override('run', folder)} {words}"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert (folder / "points.csv").is_file()
 
 
 def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(

@@ -1,8 +1,8 @@
 """Every belief of conf/belief, found on disk: the duties of all, and a run of each.
 
-A new file there is tested here without an edit. What one of them does that others do not stands in
-test_baseline_beliefs.py, test_transformer_belief.py, test_belief_filter_module.py and
-test_particle_filter.py.
+A new file there is tested here without an edit. gru_action reads the action and gru does not;
+filling keeps the last value. What else one does that others do not stands in
+test_transformer_belief.py, test_belief_filter_module.py and test_particle_filter.py.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import functools
 import pytest
 import torch
 from contracts import ACTION, OBS, RecipeBeliefContract
+from torchrl.modules import set_recurrent_mode
 
 pytest.importorskip("hydra")
 from recipe_tools import BELIEFS, assembled, differences, make_config, saved  # isort: skip
@@ -83,3 +84,33 @@ def test_a_run_learns_and_goes_on_from_its_files_to_the_last_bit(belief):
     assert torch.tensor(numbers, dtype=torch.float64).isfinite().all()
     for old, new in zip(start, whole.agent.parameters(), strict=True):
         assert not torch.equal(old, new)
+
+
+def test_only_gru_action_reads_the_action():
+    for name, reads in (("gru", False), ("gru_action", True)):
+        every = TestEveryBelief()
+        every.name = name
+        frames, changed, module = every.frames(), every.frames(), every.make_belief().module
+        changed["previous_action"] += 1.0
+        with set_recurrent_mode(True):
+            before, after = module(frames)["features"], module(changed)["features"]
+        assert torch.equal(before, after) is not reads
+
+
+def test_filling_holds_the_last_normalised_value_and_the_mean_before_the_first():
+    with torch.random.fork_rng():
+        words = ("experiment=smoke", "belief=fill", "missingness=mcar")
+        training, _ = assembled(*words)
+        training.agent.norm.update(training.collector.rollout())
+        training.start_episodes()
+        data = training.collector.rollout()
+    seen, value, start = data["observed"], data["normalized_observation"], data["is_init"]
+    held = torch.zeros_like(value[:, 0])  # 0 is the running mean, which raw 0 may be far from
+    never = 0
+    for t in range(data.shape[1]):
+        held = torch.where(start[:, t], 0.0, held)
+        held = torch.where(seen[:, t], value[:, t], held)
+        assert torch.equal(data["features"][:, t], held)
+        never += int((held == 0).sum())
+    assert never > 0
+    assert (data["features"][~seen] != 0).float().mean() > 0.5

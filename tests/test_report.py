@@ -130,15 +130,6 @@ def test_the_interval_of_few_runs_is_their_range_and_of_one_run_nothing() -> Non
     assert np.isnan(interval([6.0])).all()
 
 
-def test_the_interval_of_many_runs_agrees_with_the_normal_approximation() -> None:
-    values = np.random.default_rng(0).normal(size=400)
-    half = 1.96 * values.std() / np.sqrt(400)
-    mean = lambda sample, axis: sample.mean(axis)  # noqa: E731
-    ends = interval(values, statistic=mean)
-    np.testing.assert_allclose(ends, [values.mean() - half, values.mean() + half], atol=0.01)
-    assert interval(values, statistic=mean) == ends  # the same at every call
-
-
 def test_runs_are_resampled_within_their_task_and_curves_as_a_whole() -> None:
     assert interval([1.0, 1.0], [5.0, 5.0]) == (3.0, 3.0)
     curves = np.array([[1.0, 2.0, 4.0], [5.0, 6.0, 4.0]])
