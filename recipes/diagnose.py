@@ -117,10 +117,7 @@ def _diagnoses(
                 say(f"{folder.name}, {condition.name}: no rows, {error}")
                 continue
             say(f"{folder.name}, {condition.name}, {_summary(tally)}")
-            yield (
-                columns | {"point": condition.name, "mode": config["mode"], "runs": 1},
-                tally,
-            )
+            yield (columns | {"point": condition.name, "mode": config["mode"], "runs": 1}, tally)
 
 
 def _summary(tally: Tally) -> str:

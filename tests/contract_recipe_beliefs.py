@@ -271,12 +271,7 @@ class RecipeBeliefContract(BeliefFrames):
         weights = {id(parameter) for parameter in belief.module.parameters()}
         assert {id(parameter) for parameter in observing.parameters()} <= weights
         told = {beliefs.FORECAST_COV: (3, OBS, OBS)} | dict.fromkeys(
-            (
-                beliefs.ESTIMATE,
-                beliefs.ESTIMATE_VARIANCE,
-                beliefs.FORECAST,
-                beliefs.NOISE_VARIANCE,
-            ),
+            (beliefs.ESTIMATE, beliefs.ESTIMATE_VARIANCE, beliefs.FORECAST, beliefs.NOISE_VARIANCE),
             (3, OBS),
         )
         written = [key for key in told if out.get(key, None) is not None]

@@ -275,9 +275,7 @@ def test_a_forecast_gives_what_arrived_the_likelihood_that_the_belief_reports(
     env.close()
 
 
-def test_each_kind_of_belief_has_the_rows_of_what_it_knows(
-    agents: dict[str, TrainedAgent],
-) -> None:
+def test_each_kind_of_belief_has_the_rows_of_what_it_knows(agents: dict[str, TrainedAgent]) -> None:
     known = {name: tally_of(agents[name], episodes=2) for name in BELIEFS}
     estimates = {name: {pair.estimate for pair in tally.sums} for name, tally in known.items()}
     references = {"last value", "running mean"}

@@ -123,10 +123,7 @@ def test_the_next_evaluation_begins_with_every_robot(
 
 
 def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
-    drbpn: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = diagnose_recipe.diagnose
 

@@ -373,8 +373,7 @@ def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path, text: s
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["a=b", "a,b", "[ab]", "a b", "it's", 'a"b', "a*", "$HOME", "eta={0.5}", "back\\slash"],
+    "name", ["a=b", "a,b", "[ab]", "a b", "it's", 'a"b', "a*", "$HOME", "eta={0.5}", "back\\slash"]
 )
 def test_a_folder_is_found_whatever_its_name_holds(tmp_path: Path, name: str) -> None:
     folder = tmp_path / name

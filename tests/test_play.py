@@ -212,10 +212,7 @@ def test_the_robot_of_each_step_is_in_its_frame(recording: Recording) -> None:
 
 
 def test_the_robot_is_drawn_where_this_machine_can_and_else_one_line_says_why(
-    drbpn: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pictures = record(drbpn, steps=2, picture_size=(60, 80)).pictures
     failed = "off-screen rendering failed" in capsys.readouterr().out

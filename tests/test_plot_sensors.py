@@ -32,12 +32,7 @@ from matplotlib.image import imread
 from omegaconf import OmegaConf
 from training.errors import UserError
 
-from torchrl_drbpn import (
-    BeliefFilterModule,
-    GaussianTransition,
-    LinearGaussianEmission,
-    functional,
-)
+from torchrl_drbpn import BeliefFilterModule, GaussianTransition, LinearGaussianEmission, functional
 
 OBS, ACTION = 11, 3
 HOPPER = ("env=hopper", "env.version=v4")

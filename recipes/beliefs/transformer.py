@@ -105,10 +105,7 @@ class MemoryLayer(nn.Module):
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
         self.attention = MemoryAttention(width, heads, window)
         self.feedforward = nn.Sequential(
-            nn.LayerNorm(width),
-            nn.Linear(width, 2 * width),
-            nn.ReLU(),
-            nn.Linear(2 * width, width),
+            nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)
         )
 
     def forward(self, x: Tensor, memory: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:

@@ -49,12 +49,7 @@ class Table:
     """
 
     def __init__(
-        self,
-        path: Path,
-        protocol: Protocol,
-        agents: Mapping[str, TrainedAgent],
-        *,
-        overwrite: bool,
+        self, path: Path, protocol: Protocol, agents: Mapping[str, TrainedAgent], *, overwrite: bool
     ) -> None:
         self.path, self.rows = path, pd.DataFrame(columns=_KEY)
         if overwrite or not path.is_file():

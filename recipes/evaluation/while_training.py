@@ -14,11 +14,7 @@ from evaluation.trained import TrainedAgent
 
 
 def evaluate_training(
-    config: DictConfig,
-    training: Training,
-    kind: str,
-    episodes: int,
-    stop: Callable[[], bool],
+    config: DictConfig, training: Training, kind: str, episodes: int, stop: Callable[[], bool]
 ) -> list[dict[str, Any]] | None:
     """Evaluate the agent of a run as it is now; nothing of the training changes.
 
