@@ -34,7 +34,7 @@ from analysis.calibration_tables import (
     precision_rows,
     reliability_rows,
 )
-from analysis.scores import gaussian_crps, gaussian_log_score, gaussian_pit
+from analysis.scores import gaussian_crps, gaussian_log_score
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.image import imread
@@ -440,13 +440,6 @@ def randn(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_the_probability_transform_of_the_right_gaussians_is_uniform():
-    mean, std = randn(20_000, seed=1), randn(20_000, seed=2).abs() + 0.1
-    pit = gaussian_pit(mean + std * randn(20_000, seed=3), mean, std)
-    grid = (torch.arange(20_000) + 0.5) / 20_000
-    assert (pit.sort().values - grid).abs().max() < 1.63 / 20_000**0.5  # Kolmogorov and Smirnov
-
-
 @pytest.mark.parametrize("std", [0.2, 1.0, 3.0])
 @pytest.mark.parametrize("value", [-2.5, 0.3, 4.0])
 def test_the_crps_equals_the_integral_of_its_definition(value, std):
@@ -467,18 +460,11 @@ def test_the_crps_without_a_spread_is_the_absolute_error():
     assert (gaussian_crps(value, value, zero) == 0).all()
 
 
-@pytest.mark.parametrize("score", [gaussian_crps, gaussian_log_score])
-def test_no_other_deviation_or_mean_scores_better_than_the_right_one(score):
+def test_no_other_deviation_or_mean_scores_better_than_the_right_one():
     value = randn(50_000, seed=7)
 
     def mean_score(mean: float, std: float) -> float:
-        return score(value, torch.tensor(mean), torch.tensor(std)).mean().item()
+        return gaussian_crps(value, torch.tensor(mean), torch.tensor(std)).mean().item()
 
     others = [(0.0, 0.7), (0.0, 1.4), (0.3, 1.0), (-0.3, 1.0)]
     assert all(mean_score(*other) > mean_score(0.0, 1.0) for other in others)
-
-
-def test_the_log_score_of_an_entry_is_minus_its_log_density():
-    value, mean, std = randn(9, seed=1), randn(9, seed=2), randn(9, seed=3).abs() + 0.1
-    expected = -torch.distributions.Normal(mean, std).log_prob(value)
-    torch.testing.assert_close(gaussian_log_score(value, mean, std), expected)

@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from training.errors import UserError
 
-from analysis.scores import gaussian_crps, gaussian_log_score, gaussian_pit
+from analysis.scores import gaussian_crps
 from torchrl_drbpn.functional import nis, zero_missing
 
 COVERAGE = (0.5, 0.9, 0.95)
@@ -105,12 +105,14 @@ class Tally:
     ) -> Sums:
         value, mean = steps[pair.target], steps[pair.estimate]
         std = variance.clamp_min(_SMALLEST_VARIANCE).sqrt()
-        error, pit = value - mean, gaussian_pit(value, mean, std)
+        normal = torch.distributions.Normal(mean, std, validate_args=False)
+        # What had the probability to lie lower: uniform if the belief is right.
+        error, pit = value - mean, normal.cdf(value)  # type: ignore[no-untyped-call]
         numbers = {
             "squared": error.square(),
             "variance": variance,
             "crps": gaussian_crps(value, mean, std),
-            "log_score": gaussian_log_score(value, mean, std),
+            "log_score": -normal.log_prob(value),  # type: ignore[no-untyped-call]
         }
         inside = (2 * pit - 1).abs()
         numbers |= {f"inside_{level:g}": (inside <= level).double() for level in COVERAGE}

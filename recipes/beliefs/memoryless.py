@@ -9,25 +9,23 @@ from torch import Tensor, nn
 from beliefs import ESTIMATE, OBSERVATION, Belief
 
 
-class ObservationFeatures(nn.Module):
+def _features(observation: Tensor, observed: Tensor) -> Tensor:
     """Hand on what arrived; a missing entry is 0, the running mean."""
+    del observed
+    return observation
 
-    def __init__(self, with_mask: bool) -> None:
-        super().__init__()
-        self.with_mask = with_mask
 
-    def forward(self, observation: Tensor, observed: Tensor) -> Tensor:
-        """Return the observation, ``(*, obs)``, with the mask behind it where asked for."""
-        if self.with_mask:
-            return torch.cat([observation, observed.to(observation.dtype)], -1)
-        return observation
+def _features_and_mask(observation: Tensor, observed: Tensor) -> Tensor:
+    return torch.cat([observation, observed.to(observation.dtype)], -1)
 
 
 def build(*, obs_dim: int, action_dim: int, with_mask: bool, filled: bool) -> Belief:
     """Build the absence of a belief; ``filled``: what arrives is what is held of each sensor."""
     del action_dim
     module = TensorDictModule(
-        ObservationFeatures(with_mask), in_keys=[OBSERVATION, "observed"], out_keys=["features"]
+        _features_and_mask if with_mask else _features,
+        in_keys=[OBSERVATION, "observed"],
+        out_keys=["features"],
     )
     held = TensorDictModule(nn.Identity(), in_keys=[OBSERVATION], out_keys=[ESTIMATE])
     return Belief(

@@ -145,12 +145,9 @@ def default_conditions(
             # there is no chain that is off so much of the time and comes back so soon
             if ratio < 1 and length >= max(1.0, ratio / (1 - ratio) - 1e-9)
         ]
-        out += [f"noise:{sigma:g}" for sigma in levels["noise_sigmas"]]
-        out += [f"spikes:{probability:g}" for probability in levels["spike_probabilities"]]
-        out += [f"stuck:{probability:g}" for probability in levels["stuck_probabilities"]]
-        out += [f"drift:{std:g}" for std in levels["drift_stds"]]
-        out += [f"delay:{steps}" for steps in levels["delays"]]
-        out += [f"multi_rate:{period}" for period in levels["periods"]]
+        rest = {"noise": "noise_sigmas", "spikes": "spike_probabilities", "drift": "drift_stds"}
+        rest |= {"stuck": "stuck_probabilities", "delay": "delays", "multi_rate": "periods"}
+        out += [f"{family}:{level:g}" for family, key in rest.items() for level in levels[key]]
     return out
 
 

@@ -19,7 +19,7 @@ from training.agent import Agent, add_primers, load_agent, make_agent
 from training.checkpoint import fitting
 from training.envs import env_name, make_env
 from training.errors import UserError
-from training.run_folder import load_config
+from training.run_folder import load_config, whole
 from training.sensors import sensor_names
 
 from evaluation.episodes import BLOCK
@@ -141,9 +141,8 @@ def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
 def save_weights(folder: Path, trained: TrainedAgent) -> None:
     """Write the weights of an agent whole, the statistics of its normalisation among them."""
     tensors = {name: value.contiguous() for name, value in trained.agent.state_dict().items()}
-    temporary = folder / f".{WEIGHTS}.tmp"
-    save_file(tensors, temporary, metadata={"frames": str(trained.frames)})
-    temporary.replace(folder / WEIGHTS)
+    with whole(folder / WEIGHTS) as temporary:
+        save_file(tensors, temporary, metadata={"frames": str(trained.frames)})
 
 
 def _load_weights(path: Path, agent: Agent) -> int:

@@ -156,16 +156,14 @@ def _environment(stop_file: Path, *, apart: bool) -> Iterator[None]:
     if apart:
         path = os.pathsep.join(filter(None, [_RECIPES, os.environ.get("PYTHONPATH")]))
         changed |= {"PYTHONPATH": path, "TQDM_DISABLE": "1"}
-    before = {name: os.environ.get(name) for name in changed}
+    before = {name: os.environ[name] for name in changed.keys() & os.environ.keys()}
     os.environ.update(changed)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in changed:
+            del os.environ[name]
+        os.environ.update(before)
         stop_file.unlink(missing_ok=True)
 
 

@@ -1,4 +1,4 @@
-"""The look of every figure, and how one is written. Nothing here loads torch."""
+"""The look of every figure, and how one is written."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from PIL import Image
+from training.run_folder import whole
 
 STYLE: Any = {
     "font.size": 9.5,
@@ -51,14 +52,10 @@ def legend_below(figure: Figure, columns: int, **look: Any) -> None:
 
 def save_figure(figure: Figure, path: Path, *, dpi: int, palette: bool = False) -> None:
     """Write a PNG whole or not at all; ``palette``: 256 colours, a third of the size."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
+    with whole(path) as temporary:
         # No date and no version: the same figure gives the same bytes.
         figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
         if palette:
             with Image.open(temporary) as picture:
                 few = picture.convert("RGB").quantize(256, kmeans=1)
             few.save(temporary, format="png", optimize=True)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

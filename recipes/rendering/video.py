@@ -8,7 +8,6 @@ logger, none of which writes a GIF or takes a file's name; imageio does both.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -19,6 +18,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
+from training.run_folder import whole
 
 from rendering.belief_figure import draw_panels, legend_of
 from rendering.style import STYLE
@@ -113,19 +113,15 @@ class Film(Sequence[Picture]):
 
 def write_video(path: Path, frames: Sequence[Picture], *, fps: float, colours: int) -> None:
     """Write a GIF or MP4 whole or not at all, by the suffix; fewer colours make a smaller GIF."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
-        if path.suffix == ".mp4":
-            # H.264 works in blocks of 16 pixels, but asks for even sides only.
-            options: dict[str, Any] = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2}
-            pictures = list(frames)
-        else:
-            options = {"plugin": "pillow", "duration": 10 * round(100 / fps), "loop": 0}
-            pictures = list(_few_colours(frames, colours))
-        iio.imwrite(temporary, cast(Any, pictures), **options)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    if path.suffix == ".mp4":
+        # H.264 works in blocks of 16 pixels, but asks for even sides only.
+        options: dict[str, Any] = {"plugin": "FFMPEG", "fps": fps, "macro_block_size": 2}
+        pictures = list(frames)
+    else:
+        options = {"plugin": "pillow", "duration": 10 * round(100 / fps), "loop": 0}
+        pictures = list(_few_colours(frames, colours))
+    with whole(path) as temporary:
+        iio.imwrite(temporary, cast(Any, pictures), extension=path.suffix, **options)
 
 
 def _few_colours(frames: Sequence[Picture], colours: int) -> Iterator[Picture]:

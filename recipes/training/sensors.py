@@ -47,11 +47,6 @@ def sensor_names(task: str, version: str | None, obs_dim: int) -> list[str]:
     return names
 
 
-def named_tasks() -> list[tuple[str, str]]:
-    """Return the (task, version) pairs that have a table."""
-    return sorted((task, version) for task, _, version in (n.rpartition("-") for n in _table()))
-
-
 # What a name says about a part of the robot, behind the part's own name or before it.
 _QUANTITY = re.compile(
     r" (?:(?:[xyz] )?(?:angular )?velocity|angle|position|height|orientation [wxyz]"
