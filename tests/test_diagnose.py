@@ -34,7 +34,7 @@ from analysis.calibration_tables import (
     precision_rows,
     reliability_rows,
 )
-from analysis.scores import gaussian_crps, gaussian_log_score
+from analysis.scores import gaussian_crps
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.image import imread
