@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from ppo_drbpn import collect, train_rollout
+from ppo_drbpn import collect
 from recipe_tools import assembled, make_config, read_table, run
 from training.envs import make_env
 from training.ppo import add_advantages, to_sequences
@@ -118,14 +118,6 @@ def test_every_belief_trains_with_it(belief):
     first = training.agent.critic.module[0]
     (grad,) = torch.autograd.grad(out["loss_critic"], first.weight, retain_graph=True)
     assert grad[:, -data[COMPLETE].shape[-1] :].abs().min() > 0
-    with torch.random.fork_rng():
-        training, config = assembled(*SMOKE, f"belief={belief}")
-        before = [p.clone() for p in training.agent.critic.parameters()]
-        row, _ = train_rollout(training, config)
-    values = [value for value in row.values() if isinstance(value, float)]
-    assert torch.tensor(values).isfinite().all()
-    after = training.agent.critic.parameters()
-    assert all((new != old).any() for new, old in zip(after, before, strict=True))
 
 
 def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path: Path):
