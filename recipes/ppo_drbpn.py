@@ -17,7 +17,7 @@ from typing import Any
 import hydra
 import torch
 from evaluation.folders import override
-from evaluation.while_training import evaluate_training
+from evaluation.trained import evaluate_training
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra_plugins.cell_sweeper import continued, run_cell

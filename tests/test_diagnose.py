@@ -26,7 +26,7 @@ from evaluation_tools import parse, read_rows  # isort: skip
 
 import diagnose
 from analysis import calibration as diagnosis
-from analysis.calibration import Compared, Tally, class_names
+from analysis.calibration import Compared, Tally, class_names, gaussian_crps
 from analysis.calibration_figures import outage_figure
 from analysis.calibration_tables import (
     Resampling,
@@ -34,7 +34,6 @@ from analysis.calibration_tables import (
     precision_rows,
     reliability_rows,
 )
-from analysis.scores import gaussian_crps
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.image import imread

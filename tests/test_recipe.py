@@ -39,7 +39,7 @@ from recipe_tools import (  # isort: skip
     saved,
 )
 
-from evaluation.while_training import evaluate_training
+from evaluation.trained import evaluate_training
 from ppo_drbpn import train_rollout
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.errors import DivergedError, UserError

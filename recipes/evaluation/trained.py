@@ -19,10 +19,11 @@ from training.agent import Agent, add_primers, load_agent, make_agent
 from training.checkpoint import fitting
 from training.envs import env_name, make_env
 from training.errors import UserError
-from training.run_folder import load_config, whole
+from training.run_folder import EVALUATION_COLUMNS, load_config, whole
 from training.sensors import sensor_names
+from training.state import Training
 
-from evaluation.episodes import BLOCK
+from evaluation.episodes import BLOCK, evaluate, over_episodes
 from evaluation.points import method_name, missingness_name
 from torchrl_drbpn import BeliefFilterModule, SensorReduction
 
@@ -156,3 +157,26 @@ def _load_weights(path: Path, agent: Agent) -> int:
     with fitting(str(path)):
         agent.load_state_dict(weights)
     return frames
+
+
+def evaluate_training(
+    config: DictConfig, training: Training, kind: str, episodes: int, stop: Callable[[], bool]
+) -> list[dict[str, Any]] | None:
+    """Evaluate the agent of a run as it is now; nothing of the training changes.
+
+    Returns a row for each kind of action, or None where ``stop``, asked at every step, gave the
+    evaluation up.
+    """
+    make_env = TrainedAgent(config, training.agent, training.frames).environments()
+    how: Any = {"episodes": episodes, "seed": config.evaluation.seed, "stop": stop}
+    rows = []
+    for mode in config.evaluation.modes:
+        result = evaluate(training.agent.policy, make_env, mode=mode, **how)
+        if result is None:
+            return None
+        result = result.assign(frames=training.frames, kind=kind, mode=mode)
+        table = over_episodes(result, ["frames", "kind", "mode"])
+        table = table.fillna({"return_std": 0.0})  # of one episode
+        (row,) = table.astype(object).to_dict("records")
+        rows.append({c: None if row[c] != row[c] else row[c] for c in EVALUATION_COLUMNS})
+    return rows
