@@ -76,7 +76,7 @@ def test_a_run_leaves_configuration_tables_checkpoints_and_versions(smoke: Path)
     versions = json.loads((smoke / "versions.json").read_text())
     assert {"python", "torch", "torchrl", "gymnasium", "mujoco", "git_commit"} < versions.keys()
     assert list((smoke / "logs").rglob("*.csv"))
-    assert not list(smoke.rglob("*.tmp"))
+    assert not list(smoke.rglob(".*.tmp*"))
 
 
 def test_each_finished_episode_is_a_row_with_its_raw_return(smoke: Path) -> None:
@@ -358,7 +358,7 @@ def test_a_full_disk_ends_in_one_line_and_the_last_checkpoint_stays(
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "\n" not in str(error.value)
     assert last_checkpoint(folder).name == "frames_000000000256.pt"
-    assert not list(folder.rglob("*.tmp"))
+    assert not list(folder.rglob(".*.tmp*"))
     assert resume(folder) == 0
     assert_same_run(smoke, folder)
 
@@ -374,7 +374,7 @@ def test_what_a_killed_writer_left_is_removed_and_foreign_files_are_left_alone(
         path.write_text("half")
     assert resume(folder) == 0
     assert_same_run(smoke, folder)
-    assert not list(folder.rglob("*.tmp"))
+    assert not list(folder.rglob(".*.tmp*"))
     assert foreign.read_text() == "half"
 
 

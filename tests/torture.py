@@ -153,7 +153,7 @@ def kills(work: Path, draw: random.Random, count: int) -> list[str]:
                 shutil.rmtree(killed, ignore_errors=True)
         finished(killed, words)
         different = unequal(straight, killed)
-        left = [str(path) for path in killed.rglob(".*.tmp")]
+        left = [str(path) for path in killed.rglob(".*.tmp*")]
         wrong += [f"{name}: {line}" for line in different + left]
         progress(f"kills: {name}: {share}, {len(wrong)} wrong so far")
     told = ", ".join(f"{n} {stage}" for stage, n in sorted(stages.items()))
@@ -314,7 +314,7 @@ def planted(work: Path, draw: random.Random, count: int) -> list[str]:
         status = process.ends()
         if name in harmless:
             different = unequal(straight, folder) if status == 0 else [process.log.read_text()]
-            left = [] if name == "frames_zzz.pt" else [str(p) for p in folder.rglob(".*.tmp")]
+            left = [] if name == "frames_zzz.pt" else [str(p) for p in folder.rglob(".*.tmp*")]
             # A table that is gone lacks what the checkpoint believes is in it.
             wanted = ["evaluation.csv"] if name == "a lost evaluation" else []
             ignored += different + left == wanted

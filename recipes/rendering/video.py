@@ -121,7 +121,7 @@ def write_video(path: Path, frames: Sequence[Picture], *, fps: float, colours: i
         options = {"plugin": "pillow", "duration": 10 * round(100 / fps), "loop": 0}
         pictures = list(_few_colours(frames, colours))
     with whole(path) as temporary:
-        iio.imwrite(temporary, cast(Any, pictures), extension=path.suffix, **options)
+        iio.imwrite(temporary, cast(Any, pictures), **options)
 
 
 def _few_colours(frames: Sequence[Picture], colours: int) -> Iterator[Picture]:

@@ -45,7 +45,7 @@ _METRICS = (
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """Give a file to write to, which takes the name of ``path`` at the end, or goes."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
@@ -202,7 +202,7 @@ def locked(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise UserError(f"`{folder}` is in use by a run that has not ended.") from error
         try:
-            for stale in folder.glob(".*.tmp"):  # of a writer that was killed
+            for stale in folder.glob(".*.tmp*"):  # of a writer that was killed
                 stale.unlink()
             yield
         except OSError as error:
