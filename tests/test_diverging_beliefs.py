@@ -52,7 +52,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
         return out
 
     def look(env: GymnasiumBatchEnv, *arrays: Any) -> None:
-        actions.append(arrays[1].copy())
+        actions.append(arrays[1].action.copy())
         advance(env, *arrays)
 
     advance = GymnasiumBatchEnv._advance

@@ -75,7 +75,7 @@ def test_with_fewer_than_two_values_the_spread_is_one(seen):
 
 def test_other_masks_and_sensors_are_refused():
     for mask in (torch.ones(4, 2), torch.ones(4).bool()):
-        with pytest.raises(ValueError, match="`observed` must be bool of the shape"):
+        with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
             masked_moments(torch.zeros(4, 2), mask)
     with pytest.raises(ValueError, match=r"one shape \(\*event\), got \[\(2,\), \(3,\)\]"):
         merge_moments(nothing(2), nothing(3))

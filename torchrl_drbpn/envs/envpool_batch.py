@@ -1,9 +1,8 @@
 """Many EnvPool simulators as one TorchRL environment, one TensorDict a step.
 
-EnvPool steps its simulators in C++ threads of its own, without the interpreter between them. It
-starts the next episode by itself when a finished simulator is stepped, and it calls an episode
-that terminates on the last step of the time limit truncated. Both are avoided here: its own time
-limit is set out of reach and kept by the batch, and finished rows are reset by number.
+EnvPool steps in C++ threads of its own. It starts the next episode by itself when a finished
+simulator is stepped, and calls an episode that terminates on the last step of the time limit
+truncated. Both are avoided: its own limit is out of reach and finished rows are reset by number.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch
+from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch, StepArrays
 
 __all__ = ["EnvPoolBatchEnv"]
 
@@ -30,7 +29,7 @@ class EnvPoolBatchEnv(SimulatorBatch):
     :class:`~torchrl_drbpn.GymnasiumBatchEnv`, with ids of EnvPool and without ``make_kwargs``; the
     threads are EnvPool's own. The package is an extra: ``pip install 'torchrl-drbpn[envpool]'``.
 
-    What differs from ``GymnasiumBatchEnv``:
+    What differs:
 
     - EnvPool 1.2.5 carries MuJoCo 3.6, so that trajectories from equal states agree with those of
       Gymnasium on MuJoCo 4.0 closely, not exactly, and its random numbers are others: a seed gives
@@ -41,9 +40,6 @@ class EnvPoolBatchEnv(SimulatorBatch):
     - The state can not be saved: :attr:`supports_state` is False, ``state_dict()`` is empty, and
       the caller has to start new episodes. A copy or a pickle starts new episodes too.
     - Resets of MuJoCo by itself can not be seen: :attr:`engine_resets` stays 0.
-
-    Raises:
-        ModuleNotFoundError: if EnvPool is not installed; else as ``GymnasiumBatchEnv``.
 
     Examples:
         >>> env = EnvPoolBatchEnv("InvertedPendulum-v5", 3, seed=0)
@@ -115,16 +111,7 @@ class EnvPoolBatchEnv(SimulatorBatch):
         )
         self._over[:] = self._started[:] = False
 
-    def _advance(
-        self,
-        rows: NDArray[np.int64] | None,
-        action: NDArray[Any],
-        observation: NDArray[np.float64],
-        reward: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
-    ) -> None:
-        del truncated  # EnvPool's own limit is out of reach
+    def _advance(self, rows: NDArray[np.int64] | None, arrays: StepArrays) -> None:
         chosen = np.arange(self.num_envs) if rows is None else rows
         if self._over[chosen].any():
             row = chosen[self._over[chosen]][0]
@@ -134,8 +121,10 @@ class EnvPoolBatchEnv(SimulatorBatch):
             )
         if len(chosen):
             numbered = () if rows is None else (rows,)
-            seen, gained, ended, _, _ = self._pool.step(action[chosen], *numbered)
-            observation[chosen], reward[chosen, 0], terminated[chosen, 0] = seen, gained, ended
+            seen, gained, ended, _, _ = self._pool.step(arrays.action[chosen], *numbered)
+            # EnvPool's own limit, which would truncate, is out of reach
+            arrays.observation[chosen], arrays.reward[chosen, 0] = seen, gained
+            arrays.terminated[chosen, 0] = ended
             self._over[chosen] = ended
 
     def _close_simulators(self) -> None:

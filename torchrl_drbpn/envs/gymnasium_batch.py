@@ -15,7 +15,7 @@ from gymnasium.wrappers import OrderEnforcing
 from numpy.typing import NDArray
 
 from torchrl_drbpn.envs.engine_warnings import bad_state_counters, model_warnings_once
-from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch, one_line
+from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch, StepArrays, one_line
 from torchrl_drbpn.envs.simulator_state import is_mujoco, load_state, save_state
 
 __all__ = ["GymnasiumBatchEnv"]
@@ -64,7 +64,6 @@ class GymnasiumBatchEnv(SimulatorBatch):
     Raises:
         ValueError: if the id is unknown, the observation is not a vector, the action is not a
             vector of bounded numbers, or a number is out of range.
-        TypeError: if ``dtype`` is not ``torch.float32`` or ``torch.float64``.
 
     Examples:
         >>> env = GymnasiumBatchEnv("InvertedPendulum-v5", 3, seed=0)
@@ -109,30 +108,23 @@ class GymnasiumBatchEnv(SimulatorBatch):
         # The batch itself refuses a step before the first reset.
         return env.env if isinstance(env, OrderEnforcing) else env
 
-    def _advance(self, rows: NDArray[np.int64] | None, *arrays: NDArray[Any]) -> None:
+    def _advance(self, rows: NDArray[np.int64] | None, arrays: StepArrays) -> None:
         if rows is not None:
-            self._step_rows(rows.tolist(), *arrays)
+            self._step_rows(rows.tolist(), arrays)
         elif self.num_threads == 1:
-            self._step_rows(self._shares[0], *arrays)
+            self._step_rows(self._shares[0], arrays)
         else:
             # Each thread writes rows of its own, so that their order is free.
             if self._pool is None:
                 self._pool = ThreadPoolExecutor(len(self._shares) - 1, "gymnasium-batch")
-            others = [self._pool.submit(self._step_rows, s, *arrays) for s in self._shares[1:]]
-            self._step_rows(self._shares[0], *arrays)
+            others = [self._pool.submit(self._step_rows, s, arrays) for s in self._shares[1:]]
+            self._step_rows(self._shares[0], arrays)
             for other in others:
                 other.result()
 
-    def _step_rows(
-        self,
-        rows: Sequence[int],
-        action: NDArray[Any],
-        observation: NDArray[np.float64],
-        reward: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
-    ) -> None:
+    def _step_rows(self, rows: Sequence[int], arrays: StepArrays) -> None:
         """Step the environments ``rows`` one after the other and write what they return."""
+        action, observation, reward, terminated, truncated = arrays
         steps, warned, i = self._steps, self._warned, -1
         try:
             for i in rows:
@@ -189,11 +181,9 @@ class GymnasiumBatchEnv(SimulatorBatch):
     def get_extra_state(self) -> dict[str, Any]:
         """Return the whole state as tensors, which ``torch.load(weights_only=True)`` reads.
 
-        Returns:
-            ``simulators`` (see ``simulator_state``), ``elapsed`` int64 ``(num_envs,)`` steps since
-            the reset, ``seeds`` int64 ``(num_envs,)`` seeds that the next reset uses (-1: none),
-            ``started`` bool ``(num_envs,)``, ``observation`` float64 ``(num_envs, obs)`` and
-            ``engine_resets`` int64 ``(num_envs,)``. Empty where :attr:`supports_state` is False.
+        ``simulators`` (see ``simulator_state``) and for every row ``elapsed`` steps since the
+        reset, ``seeds`` of the next reset (-1: none), ``started``, ``observation`` and
+        ``engine_resets``. Empty where :attr:`supports_state` is False.
         """
         if not self.supports_state:
             return super().get_extra_state()

@@ -7,7 +7,7 @@ batch pays it once for all of them: what the simulators return crosses into torc
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
 import numpy as np
@@ -17,13 +17,23 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-__all__ = ["NO_SEED", "SimulatorBatch", "SimulatorError", "one_line"]
+__all__ = ["NO_SEED", "SimulatorBatch", "SimulatorError", "StepArrays", "one_line"]
 
 NO_SEED = -1
 
 
 class SimulatorError(RuntimeError):
     """A simulator raised, or returned a reward that is not finite; says which one, and when."""
+
+
+class StepArrays(NamedTuple):
+    """One row an environment: the clipped action, and what a step writes."""
+
+    action: NDArray[Any]
+    observation: NDArray[np.float64]
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
 
 
 class SimulatorBatch(EnvBase):
@@ -76,16 +86,8 @@ class SimulatorBatch(EnvBase):
         """Make the simulators; return both spaces, the registered and the task's own time limit."""
 
     @abstractmethod
-    def _advance(
-        self,
-        rows: NDArray[np.int64] | None,
-        action: NDArray[Any],
-        observation: NDArray[np.float64],
-        reward: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
-    ) -> None:
-        """Step ``rows`` (None: all) with clipped actions; write into their rows of the arrays."""
+    def _advance(self, rows: NDArray[np.int64] | None, arrays: StepArrays) -> None:
+        """Step ``rows`` (None: all) and write into their rows of the arrays."""
 
     @abstractmethod
     def _restart(
@@ -151,7 +153,7 @@ class SimulatorBatch(EnvBase):
             for flag, name in ((terminated, "terminated"), (truncated, "truncated")):
                 if (last := tensordict.get(name, None)) is not None:
                     flag[:] = last.cpu().numpy()
-        self._advance(rows, action, observation, reward, terminated, truncated)
+        self._advance(rows, StepArrays(action, observation, reward, terminated, truncated))
         if not np.isfinite(reward).all():
             row = int(np.isfinite(reward[:, 0]).argmin())
             self._fail(row, f"returned the reward {reward[row, 0]} in `step`")
@@ -233,9 +235,6 @@ class SimulatorBatch(EnvBase):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that :meth:`get_extra_state` returned; ``load_state_dict`` calls it.
 
-        Args:
-            state: what an environment like this one saved.
-
         Raises:
             ValueError: if the state is of another task or number of environments, or incomplete.
             RuntimeError: for a state where :attr:`supports_state` is False.
@@ -247,11 +246,7 @@ class SimulatorBatch(EnvBase):
             )
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the simulators, their renderers and the threads.
-
-        Args:
-            raise_if_closed: raise a RuntimeError if the environment was closed before.
-        """
+        """Close simulators, renderers, threads; `raise_if_closed` forbids to do it twice."""
         if self.is_closed and raise_if_closed:
             raise RuntimeError("trying to close a closed environment")
         if not self.is_closed:
@@ -259,7 +254,7 @@ class SimulatorBatch(EnvBase):
         self.is_closed = True
 
     def __repr__(self) -> str:
-        """Name the task, the number of environments and the device."""
+        """Name task, number of environments, device and dtype."""
         return (
             f"{type(self).__name__}({self.env_id!r}, num_envs={self.num_envs}, "
             f"device={self.device}, dtype={self.dtype})"

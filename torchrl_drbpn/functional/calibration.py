@@ -31,17 +31,13 @@ def nis(innovation: Tensor, innovation_cov: Tensor, observed: Tensor) -> Tensor:
     Args:
         innovation: v, shape ``(*batch, obs)``; what stands at missing entries is ignored.
         innovation_cov: S, shape ``(*batch, obs, obs)`` or ``(obs, obs)``, over all entries.
-        observed: bool M, shape ``(*batch, obs)``, True = counts.
+        observed: bool M, shape ``(*batch, obs)``, True = counts; a ValueError for another.
 
     Returns:
         Shape ``(*batch,)``, no unit, exactly 0 where nothing was observed. Float64 whatever the
         inputs: an innovation covariance is as ill-conditioned as signal over noise.
 
-    Raises:
-        ValueError: if the mask is not bool or not of the shape of ``innovation``.
-
     Example:
-        >>> import torch
         >>> v, S = torch.tensor([3.0, float("nan")]), torch.diag(torch.tensor([9.0, 1.0]))
         >>> nis(v, S, torch.tensor([True, False])).item()
         1.0
@@ -68,7 +64,6 @@ def nees(error: Tensor, cov: Tensor) -> Tensor:
         Shape ``(*batch,)``, no unit, float64.
 
     Example:
-        >>> import torch
         >>> nees(torch.tensor([3.0, 2.0]), torch.diag(torch.tensor([9.0, 4.0]))).item()
         2.0
     """
@@ -82,17 +77,8 @@ def chi_square_quantile(probability: Tensor | float, dof: Tensor | float) -> Ten
 
     .. math:: x: \; \gamma(k/2, x/2) / \Gamma(k/2) = p
 
-    By bisection of ``torch.special.gammainc``, to the last bits of float64.
-
-    Args:
-        probability: p in [0, 1), broadcasts with ``dof``.
-        dof: k > 0, degrees of freedom.
-
-    Returns:
-        Quantiles, the broadcast shape, float64.
-
-    Raises:
-        ValueError: if a probability lies outside [0, 1) or a number of degrees is not positive.
+    By bisection of ``torch.special.gammainc``, to the last bits of float64. ``probability`` p in
+    [0, 1) and ``dof`` k > 0 broadcast; a ValueError for others.
 
     Example:
         >>> round(chi_square_quantile(0.95, 2).item(), 6)  # -2 log(1 - p)
@@ -121,10 +107,6 @@ class Consistency(NamedTuple):
         ratio: sum of the normalised squares over the sum of their degrees of freedom; 1 expected.
         lower: of the band in which it lies with the probability asked for, if the belief is right.
         upper: of that band.
-
-    Example:
-        >>> Consistency._fields
-        ('ratio', 'lower', 'upper')
     """
 
     ratio: Tensor
@@ -149,17 +131,13 @@ def consistency(
     Args:
         squared: :func:`nis` or :func:`nees` of every step.
         dof: entries of every step, the same shape; what stands at steps with none is ignored.
-        probability: of the two-sided band, 1 - alpha.
+        probability: of the two-sided band, 1 - alpha, in (0, 1).
         dim: dimension that is summed over; None: all of them.
 
     Returns:
         Ratio and band, float64, without that dimension; NaN where no entry was observed.
 
-    Raises:
-        ValueError: if the shapes differ or the probability does not lie in (0, 1).
-
     Example:
-        >>> import torch
         >>> squared = torch.distributions.Chi2(3.0).sample((4000,))
         >>> ratio, lower, upper = consistency(squared, torch.full((4000,), 3))
         >>> bool(lower < 1 < upper), bool((ratio - 1).abs() < 0.1)

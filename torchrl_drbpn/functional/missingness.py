@@ -1,10 +1,10 @@
-"""Sample missing entries and noise of an observation.
+"""Sample missing entries, outages, delays and noise of an observation.
 
 Eq. (2) [DRBPN]: noise is added to the complete observation, then entries of the noisy observation
 go missing, completely at random (MCAR), at random given what always arrives (MAR), or not at random
-(NMAR): the terms of Rubin, "Inference and missing data", Biometrika 1976. Beyond the paper: outages
-that last, and gross errors of readings that arrive. A function that draws takes a generator on the
-device of its data; None is torch's global one.
+(NMAR): the terms of Rubin, "Inference and missing data", Biometrika 1976. Functions that draw take
+`like`, a tensor `(*batch, obs)` or `(*batch, sensors)` of which only shape, device and the dtype of
+noise are read, and a generator on its device; None is torch's global one.
 """
 
 from __future__ import annotations
@@ -47,23 +47,12 @@ def draw_mechanism(
 ) -> MissingnessMechanism:
     """Draw the always observed entries and b0, b1, b2 ~ N(0, 1) of a mechanism.
 
-    round(always_observed * obs_dim) entries always arrive, at least 1. MAR and NMAR draw the same
-    numbers from the same generator state, and the action's weights come last, so that all else
-    does not depend on the number of actions.
-
-    Args:
-        kind: "mar" or "nmar".
-        obs_dim: number of entries of the observation.
-        action_dim: number of entries of the action; 0 leaves the action out.
-        always_observed: share of the entries that always arrive, in [0, 1].
-        generator: a CPU generator.
+    round(always_observed * obs_dim) entries always arrive, at least 1; a ValueError where that is
+    all of them. MAR and NMAR draw the same numbers from the same CPU generator, and the action's
+    weights come last, so that all else does not depend on `action_dim`, which may be 0.
 
     Returns:
         The mechanism, float64 on the CPU.
-
-    Raises:
-        ValueError: if `kind` is neither, `always_observed` lies outside [0, 1], or every entry
-            would always arrive.
 
     Example:
         >>> draw = lambda: draw_mechanism("mar", 8, 3, generator=torch.Generator().manual_seed(0))
@@ -107,9 +96,8 @@ def missing_probability(
 
     Args:
         mechanism: parameters, on the device and in the dtype of `observation`.
-        observation: complete observation as it arrives (noise included), shape `(*batch, obs)`.
-        previous_action: a_{t-1}, shape `(*batch, action)`; None counts as zero, as at the first
-            step of an episode.
+        observation: complete, noise included, shape `(*batch, obs)`.
+        previous_action: a_{t-1}, shape `(*batch, action)`; None counts as zero.
         eta: upper bound of the probability.
 
     Returns:
@@ -130,15 +118,7 @@ def missing_probability(
 def sample_mask(
     probability: Tensor | float, like: Tensor, generator: torch.Generator | None
 ) -> Tensor:
-    """Draw which entries arrive, each one missing with its probability, independently.
-
-    Args:
-        probability: of being missing; a number for all (MCAR) or shape `(*batch, obs)`.
-        like: a tensor of shape `(*batch, obs)`; only its shape and device are read.
-        generator: source of randomness.
-
-    Returns:
-        bool, shape `(*batch, obs)`, True where an entry arrives.
+    """Draw which entries arrive, bool; `probability` of missing is a number or `(*batch, obs)`.
 
     Example:
         >>> x = torch.zeros(3, 5)
@@ -152,15 +132,7 @@ def sample_mask(
 
 
 def sample_noise(std: Tensor | float, like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw zero-mean Gaussian noise with standard deviation `std`.
-
-    Args:
-        std: standard deviation in observation units; a number or shape `(obs,)`.
-        like: a tensor of shape `(*batch, obs)`; only its shape, dtype and device are read.
-        generator: source of randomness.
-
-    Returns:
-        Noise with the shape and dtype of `like`.
+    """Draw N(0, std^2) noise in the dtype of `like`; `std` is a number or `(obs,)`, its units.
 
     Example:
         >>> float(sample_noise(0.0, torch.ones(2, 3), None).abs().sum())
@@ -171,19 +143,14 @@ def sample_noise(std: Tensor | float, like: Tensor, generator: torch.Generator |
 
 
 class OutageRates(NamedTuple):
-    """The two transition probabilities of a sensor that fails and comes back.
-
-    Attributes:
-        failure: P(off at t | on at t - 1).
-        repair: P(on at t | off at t - 1).
-    """
+    """What a sensor does next: failure = P(on -> off), repair = P(off -> on), a step."""
 
     failure: float
     repair: float
 
     @property
     def missing_rate(self) -> float:
-        """Return the stationary probability of being off, failure / (failure + repair)."""
+        """Stationary probability of being off, failure / (failure + repair)."""
         return self.failure / (self.failure + self.repair)
 
 
@@ -197,17 +164,14 @@ def outage_rates(eta: float, mean_length: float) -> OutageRates:
 
     Args:
         eta: share of the steps that a sensor is off in the long run, in [0, 1).
-        mean_length: L, mean length of an outage in steps, at least 1.
-
-    Returns:
-        The transition probabilities.
+        mean_length: L, steps, at least 1 and at least eta / (1 - eta), where P(on -> off) is 1.
 
     Raises:
-        ValueError: if an argument is out of range, or `mean_length` is under eta / (1 - eta), where
-            P(on -> off) would exceed 1.
+        ValueError: if an argument is out of range.
 
-    >>> outage_rates(0.5, 20).repair, outage_rates(0.5, 20).missing_rate
-    (0.05, 0.5)
+    Example:
+        >>> outage_rates(0.5, 20).repair, outage_rates(0.5, 20).missing_rate
+        (0.05, 0.5)
     """
     if not 0.0 <= eta < 1.0:
         raise ValueError(
@@ -233,17 +197,7 @@ def outage_rates(eta: float, mean_length: float) -> OutageRates:
 def sample_working(
     working: Tensor | None, rates: OutageRates, like: Tensor, generator: torch.Generator | None
 ) -> Tensor:
-    """Draw which sensors work at this step, given which worked at the step before.
-
-    Args:
-        working: bool, shape `(*batch, sensors)`, True where a sensor worked at the step before;
-            None draws from the stationary distribution.
-        rates: see `outage_rates`.
-        like: a tensor of shape `(*batch, sensors)`; only its shape and device are read.
-        generator: source of randomness; every sensor takes one number a step.
-
-    Returns:
-        bool, shape `(*batch, sensors)`.
+    """Draw which sensors work, bool, from which worked at the step before; None: stationary.
 
     Example:
         >>> before = torch.tensor([True, False, True])
@@ -260,17 +214,7 @@ def sample_working(
 def sample_fault_steps(
     steps: Tensor | None, rates: OutageRates, like: Tensor, generator: torch.Generator | None
 ) -> Tensor:
-    """Draw how long every sensor's fault has lasted: the chain of `sample_working`, counted.
-
-    Args:
-        steps: int64, shape `(*batch, sensors)`, steps that the fault had lasted at the step before,
-            0 for a sensor that worked; None at the start, where all work.
-        rates: probabilities of a fault's begin and end at a step.
-        like: a tensor of shape `(*batch, sensors)`; only its shape and device are read.
-        generator: source of randomness; every sensor takes one number a step, none at the start.
-
-    Returns:
-        int64, shape `(*batch, sensors)`; 1 where a fault has begun.
+    """Draw how many steps, int64, every fault has lasted, 0 for a sensor that works; None: all do.
 
     Example:
         >>> before = torch.tensor([0, 3, 0])
@@ -286,16 +230,7 @@ def sample_fault_steps(
 def sample_delay(
     least: Tensor, most: Tensor, like: Tensor, generator: torch.Generator | None
 ) -> Tensor:
-    """Draw by how many steps each reading is late, uniformly from `least` to `most`.
-
-    Args:
-        least: int64, shape `()` or `(sensors,)`, steps.
-        most: the same, not under `least`.
-        like: a tensor of shape `(*batch, sensors)`; only its shape and device are read.
-        generator: source of randomness; every sensor takes one number.
-
-    Returns:
-        int64, shape `(*batch, sensors)`.
+    """Draw how many steps each reading is late, uniform on `least` to `most`, int64 `(sensors,)`.
 
     Example:
         >>> delay = sample_delay(torch.tensor(1), torch.tensor(3), torch.zeros(1000, 2), None)
@@ -315,15 +250,8 @@ def sample_spikes(
 ) -> tuple[Tensor, Tensor]:
     """Draw gross errors: with a small probability, an error of standard deviation `std`.
 
-    Args:
-        probability: that a reading is hit; a number or shape `(obs,)`.
-        std: standard deviation of the error in observation units; a number or shape `(obs,)`.
-        like: a tensor of shape `(*batch, obs)`; only its shape, dtype and device are read.
-        generator: source of randomness.
-
-    Returns:
-        The error, shape and dtype of `like`, 0 where there is none, and bool of the same shape,
-        True where a reading is hit. The hits do not depend on the dtype of `like`.
+    Both are numbers or `(obs,)`. Returns the error, 0 where there is none, and bool, where a
+    reading is hit, which does not depend on the dtype of `like`.
 
     Example:
         >>> error, hit = sample_spikes(0.1, 50.0, torch.zeros(200, 9), None)

@@ -17,30 +17,9 @@ from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import LOG_2PI, zero_missing
 
-__all__ = [
-    "DiagonalGaussian",
-    "ParticleModel",
-    "ParticleNoise",
-    "ParticleOutput",
-    "ParticleStep",
-    "ProposalOutput",
-    "diagonal_log_density",
-    "effective_sample_size",
-    "log_mean_weight",
-    "particle_sequence",
-    "particle_step",
-    "resample",
-    "systematic_ancestors",
-]
-
 
 class DiagonalGaussian(NamedTuple):
-    """Hold N(mean, diag(variance)).
-
-    Args:
-        mean: shape ``(*batch, dim)``.
-        variance: shape ``(*batch, dim)`` or one that broadcasts to it, positive.
-    """
+    """Hold N(mean, diag(variance)), both ``(*batch, dim)`` or what broadcasts to it."""
 
     mean: Tensor
     variance: Tensor
@@ -61,24 +40,19 @@ class ParticleNoise(NamedTuple):
 
 
 class ProposalOutput(NamedTuple):
-    """Hold the distributions of z that a model offers.
-
-    Args:
-        proposal: q(z | h, x, a), each ``(*batch, particles, latent)``.
-        transition: p(z | h, a), the same shapes.
-    """
+    """Hold q(z | h, x, a) and p(z | h, a), each ``(*batch, particles, latent)``."""
 
     proposal: DiagonalGaussian
     transition: DiagonalGaussian
 
 
 class ParticleStep(NamedTuple):
-    """Hold what a model computes from z.
+    """Hold what a model computes from z, each with a leading ``(*batch, particles)``.
 
     Args:
-        emission: p(x | h, z, a), each ``(*batch, particles, obs)``.
-        hidden: the next h, shape ``(*batch, particles, hidden)``.
-        embedding: further features of a particle, shape ``(*batch, particles, embedding)``.
+        emission: p(x | h, z, a) over ``obs``.
+        hidden: the next h.
+        embedding: further features of a particle.
     """
 
     emission: DiagonalGaussian
@@ -133,14 +107,13 @@ def diagonal_log_density(
 
     Args:
         value: x, shape ``(*batch, dim)``; missing entries may hold anything.
-        gaussian: mean and variance, shapes that broadcast with ``(*batch, dim)``.
-        observed: bool m, True = arrived, broadcasts with ``(*batch, dim)``; None: all of them.
+        gaussian: mean and variance that broadcast with it.
+        observed: bool m, True = arrived, broadcasts with it; None: all of them.
 
     Returns:
         Shape ``(*batch,)``, nats.
 
     Example:
-        >>> import torch
         >>> gaussian = DiagonalGaussian(torch.zeros(2), torch.ones(2))
         >>> x = torch.tensor([1.0, float("nan")])
         >>> seen = torch.tensor([True, False])
@@ -164,14 +137,9 @@ def log_mean_weight(log_weight: Tensor) -> Tensor:
     §3.2 [DVRL 2018]: its sum over time is a lower bound of the marginal log-likelihood, in
     expectation, and the product of the mean weights is unbiased for the marginal likelihood.
 
-    Args:
-        log_weight: shape ``(*batch, particles)``, nats.
-
-    Returns:
-        Shape ``(*batch,)``, nats.
+    From ``(*batch, particles)`` to ``(*batch,)``, nats.
 
     Example:
-        >>> import torch
         >>> log_mean_weight(torch.tensor([2.0, 4.0]).log()).exp().item()
         3.0
     """
@@ -183,14 +151,9 @@ def effective_sample_size(log_weight: Tensor) -> Tensor:
 
     .. math:: \mathrm{ESS} = 1 / \sum_k \bar w_k^2
 
-    Args:
-        log_weight: shape ``(*batch, particles)``, nats; need not be normalised.
-
-    Returns:
-        Shape ``(*batch,)``, between 1 and the number of particles.
+    From log-weights ``(*batch, particles)``, which need not be normalised, to ``(*batch,)``.
 
     Example:
-        >>> import torch
         >>> round(effective_sample_size(torch.zeros(8)).item(), 4)
         8.0
     """
@@ -215,7 +178,6 @@ def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
         Ancestors, int64, shape ``(*batch, particles)``, ascending.
 
     Example:
-        >>> import torch
         >>> log_weight = torch.tensor([0.5, 0.0, 0.25, 0.25]).log()
         >>> systematic_ancestors(log_weight, torch.tensor([0.5])).tolist()
         [0, 0, 2, 3]
@@ -231,15 +193,10 @@ def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
 def resample(values: Tensor, ancestors: Tensor) -> Tensor:
     """Let each particle take over what its ancestor holds.
 
-    Args:
-        values: shape ``(*batch, particles, dim)``.
-        ancestors: int64, shape ``(*batch, particles)``.
-
-    Returns:
-        Shape of ``values``; its gradient goes to the ancestors.
+    Values ``(*batch, particles, dim)``, int64 ancestors ``(*batch, particles)``; the gradient goes
+    to the ancestors.
 
     Example:
-        >>> import torch
         >>> resample(torch.tensor([[1.0], [2.0], [3.0]]), torch.tensor([0, 0, 2])).tolist()
         [[1.0], [1.0], [3.0]]
     """
@@ -275,9 +232,6 @@ def particle_step(
         observed: bool, shape ``(*batch, obs)``.
         noise: of this step.
 
-    Returns:
-        The particles after the step.
-
     See also :func:`particle_sequence`, whose example has a model.
     """
     hidden = resample(hidden, systematic_ancestors(log_weight, noise.resampling))
@@ -309,25 +263,13 @@ def particle_sequence(
     observed: Tensor,
     noise: ParticleNoise,
 ) -> ParticleOutput:
-    """Run :func:`particle_step` over time, one iteration a step.
+    """Run :func:`particle_step` over time, the last dimension of the batch of all arguments.
 
-    Args:
-        model: the distributions.
-        hidden: h of the step before each step, shape ``(*batch, time, particles, hidden)``; read
-            at the first step and where ``begin`` says so. Zeros are an episode's start.
-        log_weight: the same of the weights, shape ``(*batch, time, particles)``, nats.
-        begin: bool, shape ``(*batch, time)``: take the state given for this step, not that of
-            the step before.
-        inputs: for the model, each with a leading ``(*batch, time)``.
-        observation: shape ``(*batch, time, obs)``.
-        observed: bool, shape ``(*batch, time, obs)``.
-        noise: with a leading ``(*batch, time)``.
-
-    Returns:
-        The particles after every step.
+    ``begin``, bool ``(*batch, time)``, says where a step starts from the ``hidden`` and
+    ``log_weight`` given for it, as the first one does, not from those of the step before. Zeros are
+    an episode's start.
 
     Example:
-        >>> import torch
         >>> class Walk:  # z = h + noise, seen with noise; proposed from the transition itself
         ...     def propose(self, hidden, inputs):
         ...         moved = DiagonalGaussian(hidden, torch.ones_like(hidden))

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_drbpn.functional.gaussian import check_observed
+
 __all__ = ["RunningMoments", "masked_moments", "merge_moments", "spread", "winsorize"]
 
 # Its square is still a float64.
@@ -27,22 +29,14 @@ _FIRST_SHARE = 1000
 
 
 class RunningMoments(NamedTuple):
-    """Hold how many values were seen, their mean and their variance.
+    """Hold how many values were seen, their mean and their variance, each of shape ``(*event)``.
 
     The variance, unlike the sum of squares, does not grow with the count: it fits into float32.
 
     Attributes:
-        n: number of observed values of each component, shape ``(*event)``.
-        mean: their mean, 0 where nothing was observed, shape ``(*event)``, units of the values.
-        var: their population variance, 0 where fewer than two were observed, shape ``(*event)``,
-            squared units.
-
-    Example:
-        >>> import torch
-        >>> empty = RunningMoments(*torch.zeros(3, 2, dtype=torch.float64))
-        >>> batch = masked_moments(torch.randn(5, 2), torch.ones(5, 2, dtype=torch.bool))
-        >>> all(torch.equal(a, b) for a, b in zip(merge_moments(empty, batch), batch))
-        True
+        n: number of observed values of each component.
+        mean: their mean, 0 where nothing was observed, units of the values.
+        var: their population variance, 0 where fewer than two were observed, squared units.
     """
 
     n: Tensor
@@ -58,27 +52,20 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMome
 
     Args:
         value: the samples, shape ``(samples, *event)``.
-        observed: True where an entry was observed, shape ``(samples, *event)``, bool. None: all.
+        observed: bool of that shape, True where an entry was observed; a ValueError where it is
+            not. None: all.
 
     Returns:
         The moments, in float64; all 0 where nothing was observed.
 
-    Raises:
-        ValueError: if ``observed`` is not bool of the shape of ``value``.
-
     Example:
-        >>> import torch
         >>> x = torch.tensor([[1.0], [3.0], [torch.nan]])
         >>> masked_moments(x, x.isfinite()).mean
         tensor([2.], dtype=torch.float64)
     """
     if observed is None:
         observed = torch.ones_like(value, dtype=torch.bool)
-    if observed.dtype is not torch.bool or observed.shape != value.shape:
-        raise ValueError(
-            f"`observed` must be bool of the shape of `value` {tuple(value.shape)}, one entry for "
-            f"every component, got {observed.dtype} {tuple(observed.shape)}."
-        )
+    check_observed(value, observed)
     weight = observed.double()
     count = weight.sum(0)
     share = weight / count.clamp_min(1.0)
@@ -96,18 +83,9 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
     Eq. (1.5) of [Chan, Golub, LeVeque 1979, Updating formulae and a pairwise algorithm for
     computing sample variances], divided by the count.
 
-    Args:
-        first: moments of shape ``(*event)``.
-        second: moments of shape ``(*event)``.
-
-    Returns:
-        The moments of the union; neither argument is changed.
-
-    Raises:
-        ValueError: the two are of different shapes.
+    Both have one shape ``(*event)``, or a ValueError is raised; neither is changed.
 
     Example:
-        >>> import torch
         >>> x = torch.randn(9, 2, dtype=torch.float64)
         >>> split = merge_moments(masked_moments(x[:4]), masked_moments(x[4:]))
         >>> torch.allclose(split.var, masked_moments(x).var)
@@ -132,17 +110,9 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
 
 
 def spread(moments: RunningMoments, eps: float) -> Tensor:
-    r"""Return the standard deviation sqrt(var + eps), and 1 where fewer than two values were seen.
-
-    Args:
-        moments: moments of shape ``(*event)``.
-        eps: added to the variance, squared units.
-
-    Returns:
-        The deviation, shape ``(*event)``, units of the values.
+    """Return the deviation sqrt(var + eps), and 1 where fewer than two values were seen.
 
     Example:
-        >>> import torch
         >>> x = torch.randn(9, 2, dtype=torch.float64)
         >>> torch.allclose(spread(masked_moments(x), 0.0), x.std(0, correction=0))
         True
@@ -163,15 +133,14 @@ def winsorize(
 
     Args:
         value: readings, shape ``(samples, *event)``, finite where observed.
-        observed: bool, shape ``(samples, *event)``.
-        learned: the moments so far, shape ``(*event)``.
+        observed: bool of that shape.
+        learned: the moments so far.
         eps: variance from which a component counts as one that moves, squared units.
 
     Returns:
         The readings, float64, and which of them to learn from.
 
     Example:
-        >>> import torch
         >>> nothing = RunningMoments(*torch.zeros(3, 1, dtype=torch.float64))
         >>> x = torch.cat([torch.randn(999, 1), torch.tensor([[1e30]])])
         >>> bounded, _ = winsorize(x, torch.ones_like(x, dtype=torch.bool), nothing, 1e-8)

@@ -211,7 +211,7 @@ class StateSpace:
         stored_cov: Tensor | None = None,
         cov: Tensor | None = None,
     ) -> None:
-        """Raise unless ``mean``, ``cov`` are ``(*start, n)``, others ``(*steps, n)``; dtypes fit."""
+        """Raise unless means and cov are ``(*start, n)``, others ``(*steps, n)``, of its dtype."""
         obs, state, action = self.obs_dim, self.state_dim, self.action_dim
         own, flag = self.emission_matrix.dtype, torch.bool
         wanted: tuple[tuple[str, Tensor | None, torch.dtype, str, tuple[int, ...]], ...] = (

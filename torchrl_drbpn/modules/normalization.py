@@ -53,15 +53,13 @@ class MaskedObservationNorm(TensorDictModuleBase):
         out_keys: where to write the standardised observation; not in place.
         complete_keys: a complete observation and where to write it, scaled alike where it is
             there and never learned from. None: not read.
-        device: of the statistics.
-        dtype: of the statistics, float64 by default; they are computed in float64 in any case.
+        device, dtype: of the statistics, float64 by default; they are computed in it in any case.
 
     Raises:
-        ValueError: for a size, ``clip`` or ``eps`` that is not positive, an unknown ``missing``,
-            keys of the wrong number, an output in place.
+        ValueError: for a number out of range, an unknown ``missing``, keys of the wrong number, an
+            output in place.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> x = torch.randn(8, 50, 3) * 5 + 100
         >>> seen = torch.rand(8, 50, 3) < 0.7
@@ -124,9 +122,8 @@ class MaskedObservationNorm(TensorDictModuleBase):
         self.in_keys, self.out_keys = inputs, outputs
         self.obs_dim, self.clip, self.eps, self.missing = obs_dim, clip, float(eps), missing
         dtype = torch.float64 if dtype is None else dtype
-        self.register_buffer("count", torch.zeros(obs_dim, dtype=torch.int64, device=device))
-        self.register_buffer("mean", torch.zeros(obs_dim, dtype=dtype, device=device))
-        self.register_buffer("var", torch.zeros(obs_dim, dtype=dtype, device=device))
+        for name, kind in (("count", torch.int64), ("mean", dtype), ("var", dtype)):
+            self.register_buffer(name, torch.zeros(obs_dim, dtype=kind, device=device))
         self.register_load_state_dict_pre_hook(_refuse_unusable)
 
     # ------------------------------------------------------------------------------- on tensors
@@ -136,17 +133,11 @@ class MaskedObservationNorm(TensorDictModuleBase):
         return spread(RunningMoments(self.count, self.mean, self.var), self.eps)
 
     def normalize(self, observation: Tensor, observed: Tensor | None = None) -> Tensor:
-        """Return clip((x - mean) / std), 0 where nothing arrived.
+        """Return clip((x - mean) / std), 0 where nothing arrived, as a new tensor.
 
         Args:
-            observation: shape ``(*batch, obs)``, observation units.
-            observed: bool of that shape; None: everything arrived.
-
-        Returns:
-            Shape and floating dtype of ``observation``; nothing is changed in place.
-
-        Raises:
-            ValueError: for another number of components, or a mask of another shape or dtype.
+            observation: shape ``(*batch, obs)``, observation units; its floating dtype is kept.
+            observed: bool of that shape; None: everything arrived. A ValueError for another.
         """
         self._check(observation, observed)
         absent = None
@@ -163,30 +154,13 @@ class MaskedObservationNorm(TensorDictModuleBase):
         return value.to(observation.dtype if floating else torch.get_default_dtype())
 
     def denormalize(self, value: Tensor) -> Tensor:
-        """Return standardised values in observation units, x std + mean; clipping is not undone.
-
-        Args:
-            value: shape ``(*batch, obs)``, deviations.
-
-        Returns:
-            The same shape and dtype, observation units.
-        """
+        """Return x std + mean of deviations ``(*batch, obs)``, in units; clips are not undone."""
         return (value.double() * self.std + self.mean).to(value.dtype)
 
     # --------------------------------------------------------------------------- on tensordicts
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the standardised observation beside what was read.
-
-        Args:
-            tensordict: any batch size; the complete observation may be absent.
-
-        Returns:
-            The same tensordict.
-
-        Raises:
-            KeyError: if the observation or its mask is absent.
-        """
+        """Write the standardised observation beside what was read; a complete one may be absent."""
         tensordict.set(self._out_key, self.normalize(*self._read(tensordict)))
         if self._complete_keys is not None:
             source, target = self._complete_keys
@@ -208,7 +182,6 @@ class MaskedObservationNorm(TensorDictModuleBase):
                 "next" its steps alone count.
 
         Raises:
-            KeyError: if the observation or its mask is absent.
             ValueError: for a shape that does not fit, and for a reading that is NaN or infinite.
         """
         if not tensordict.ndim:
@@ -223,9 +196,8 @@ class MaskedObservationNorm(TensorDictModuleBase):
             if done is not None:
                 last |= done.reshape(tensordict.shape)
             last[..., -1:] = True
-            next_value, next_observed = self._readings(following)
-            value = torch.cat([value.flatten(0, -2), next_value[last]])
-            observed = torch.cat([observed.flatten(0, -2), next_observed[last]])
+            readings = zip((value, observed), self._readings(following), strict=True)
+            value, observed = (torch.cat([x.flatten(0, -2), y[last]]) for x, y in readings)
         else:
             value, observed = value.flatten(0, -2), observed.flatten(0, -2)
         if not bool((value.isfinite() | ~observed).all()):

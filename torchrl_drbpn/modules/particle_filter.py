@@ -32,23 +32,15 @@ class ParticleFilterModule(RecurrentBeliefModule):
         filter: the filter.
 
     Keyword Args:
-        in_key: as in :class:`~torchrl_drbpn.BeliefFilterModule`, and so are those below.
-        in_keys: ``("recurrent", "particles"), ("recurrent", "log_weight")`` take the place of
+        in_keys: as in :class:`~torchrl_drbpn.BeliefFilterModule`, as are the other arguments and
+            errors; ``("recurrent", "particles"), ("recurrent", "log_weight")`` take the place of
             ``("recurrent", "mean")``: a list has four or seven entries.
-        out_key: the key of the features.
         out_keys: chosen from ``features``, ``("belief", "log_likelihood")`` (the default) and, only
             where asked for, ``("belief", "observation")`` (the emission's mean, averaged over the
             particles: every sensor's estimate), ``("belief", "latent")`` (z of every particle),
             ``("belief", "effective_sample_size")``.
-        default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
-
-    Raises:
-        TypeError: if keys are neither a list nor a dict.
-        ValueError: for a key list of another length, an unknown name or a key given twice.
-        KeyError: at a call, if an entry is absent; the message says who writes it.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> filter = ParticleFilter(5, 2, num_particles=4, hidden_dim=8, latent_dim=3)
         >>> module = ParticleFilterModule(filter)

@@ -45,8 +45,7 @@ class ParticleFilter(nn.Module):
     and variances have a floor, without which the likelihood of clean data has no bound.
 
     Args:
-        obs_dim: components of an observation.
-        action_dim: components of an action.
+        obs_dim, action_dim: components of an observation, of an action.
 
     Keyword Args:
         num_particles: K; one particle is a sequential variational auto-encoder.
@@ -59,14 +58,12 @@ class ParticleFilter(nn.Module):
         noise_seed: of the table that the noise is read from, see :meth:`noise`.
         validate: look at values too: a NaN or inf that the mask calls observed raises ValueError.
             Needs a value on the host, so it is skipped while compiling or exporting.
-        device: of the parameters.
-        dtype: of the parameters.
+        device, dtype: of the parameters.
 
     Raises:
         ValueError: for a size under 1, a negative floor, or inputs of the wrong shape.
 
     Example:
-        >>> import torch
         >>> filter = ParticleFilter(5, 2, num_particles=4, hidden_dim=8, latent_dim=3)
         >>> action, x = torch.zeros(6, 10, 2), torch.randn(6, 10, 5)
         >>> observed = torch.rand(6, 10, 5) < 0.7
@@ -147,10 +144,8 @@ class ParticleFilter(nn.Module):
     def reset_parameters(self) -> None:
         """Start again: orthogonal weights and zero biases, as the authors' code has them."""
         gain = nn.init.calculate_gain("relu")
-        nn.init.orthogonal_(self.memory.weight_ih)
-        nn.init.orthogonal_(self.memory.weight_hh)
-        nn.init.zeros_(self.memory.bias_ih)
-        nn.init.zeros_(self.memory.bias_hh)
+        for name, parameter in self.memory.named_parameters():
+            (nn.init.orthogonal_ if "weight" in name else nn.init.zeros_)(parameter)
         if isinstance(self.aggregator, nn.GRUCell):
             self.aggregator.reset_parameters()  # PyTorch's own, in the authors' code too
         for name, part in self.named_modules():
@@ -171,7 +166,7 @@ class ParticleFilter(nn.Module):
         observed: Tensor,
         noise: ParticleNoise,
     ) -> ParticleOutput:
-        """Filter sequences; the arguments with ``time`` have it behind the batch.
+        """Filter sequences, with ``time`` behind the batch.
 
         Args:
             hidden: h of the step before each step, shape ``(*batch, time, particles, hidden)``;
@@ -181,10 +176,7 @@ class ParticleFilter(nn.Module):
             previous_action: shape ``(*batch, time, action)``.
             observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
             observed: bool, shape ``(*batch, time, obs)``, True = arrived.
-            noise: see :meth:`noise` and :class:`torchrl_drbpn.functional.ParticleNoise`.
-
-        Returns:
-            The particles after every step.
+            noise: see :meth:`noise`.
 
         Raises:
             ValueError: for a mask of another shape, or values that are not finite.
@@ -208,40 +200,16 @@ class ParticleFilter(nn.Module):
         observed: Tensor,
         noise: ParticleNoise,
     ) -> ParticleOutput:
-        """Filter one step, any batch: :meth:`forward` without its time.
-
-        Args:
-            hidden: h of the step before, shape ``(*batch, particles, hidden)``.
-            log_weight: of the step before, shape ``(*batch, particles)``, nats.
-            previous_action: shape ``(*batch, action)``.
-            observation: shape ``(*batch, obs)``.
-            observed: bool, shape ``(*batch, obs)``.
-            noise: without time.
-
-        Returns:
-            The particles after the step, without time.
-        """
+        """Filter one step, any batch: :meth:`forward` without time in arguments and results."""
         begin = torch.ones((*observation.shape[:-1], 1), dtype=torch.bool, device=hidden.device)
         rank = observation.ndim - 1
-        parts = (previous_action, observation, observed)
-        out = self(
-            hidden.unsqueeze(rank),
-            log_weight.unsqueeze(rank),
-            begin,
-            *(part.unsqueeze(rank) for part in parts),
-            ParticleNoise(*(part.unsqueeze(rank) for part in noise)),
-        )
+        state = hidden.unsqueeze(rank), log_weight.unsqueeze(rank), begin
+        inputs = (part.unsqueeze(rank) for part in (previous_action, observation, observed))
+        out = self(*state, *inputs, ParticleNoise(*(part.unsqueeze(rank) for part in noise)))
         return ParticleOutput(*(part.squeeze(rank) for part in out))
 
     def features(self, particles: ParticleOutput) -> Tensor:
-        """Gather the particles into one vector, with a recurrent network over them.
-
-        Args:
-            particles: after one step or after each of a sequence.
-
-        Returns:
-            Shape ``(*batch, [time,] hidden)``.
-        """
+        """Gather particles into one vector ``(*batch, [time,] hidden)``: a recurrent network."""
         weight = particles.log_weight.softmax(-1).unsqueeze(-1)
         each = torch.cat([particles.hidden, particles.embedding, weight], -1)
         net = self.aggregator
@@ -267,14 +235,7 @@ class ParticleFilter(nn.Module):
         in GAE and in the loss, nothing is stored, and no generator's state belongs into a
         checkpoint. Numbers are read in float32, so that casting data keeps its noise.
 
-        Args:
-            previous_action: shape ``(*batch, action)``.
-            observation: shape ``(*batch, obs)``.
-            observed: bool, shape ``(*batch, obs)``.
-            age: steps since the reset, int64, shape ``(*batch, 1)``.
-
-        Returns:
-            The noise.
+        ``age``, int64 ``(*batch, 1)``, counts steps since the reset; shapes as in :meth:`step`.
         """
         # Adding 0 turns -0 into 0.
         numbers = torch.cat([zero_missing(observation, observed), previous_action], -1) + 0.0

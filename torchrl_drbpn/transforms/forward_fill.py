@@ -44,7 +44,6 @@ class FillLastObserved(EnvironmentTransform):
         ValueError: if numbers of keys do not match, or missingness stands after the transform.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> fill = FillLastObserved()
         >>> root = TensorDict(last_observation=torch.tensor([1.0, 2.0]))

@@ -35,13 +35,9 @@ class ObservationNoise(SeededTransform):
     missing stay 0. Spec bounds are lifted, since noise leaves them.
 
     Args:
-        noise_std: standard deviation in observation units; a number for all components, or one per
-            component, shape `(obs,)`.
+        noise_std: standard deviation in observation units, finite and not negative; a number for
+            all components, or one per component, shape `(obs,)`.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
-
-    Raises:
-        ValueError: if a standard deviation is negative or not finite, or their number is not that
-            of the components.
 
     Example:
         >>> import torch
@@ -81,17 +77,13 @@ class ObservationSpikes(SeededTransform):
     Args:
         probability: that an entry is hit at a step, in [0, 1]; a number for all components, or one
             per component, shape `(obs,)`.
-        spike_std: standard deviation of the error in observation units, likewise.
+        spike_std: standard deviation of the error in observation units, finite, likewise.
 
     Keyword Args:
         spiked_key: key (or one key per observation) under which the entries that were hit are
             recorded, bool `(*batch, obs)`; None, the default, records nothing. For evaluation: no
             policy should read it.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
-
-    Raises:
-        ValueError: if a probability or a standard deviation is out of range, or their number is not
-            that of the components.
 
     Example:
         >>> import torch

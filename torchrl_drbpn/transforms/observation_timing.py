@@ -46,13 +46,11 @@ class ObservationDelay(CarriedStateTransform):
             `ObservationMissingness`.
 
     Raises:
-        ValueError: if a delay is no whole number or negative, `max_delay` is under `delay`, or
-            their number is not that of the groups; when the environment is asked for its specs,
-            also if its `StepCounter` ends episodes before the first reading of a sensor can arrive.
-            Other time limits can't be seen from here.
+        ValueError: for numbers out of range; when the environment is asked for its specs, also if
+            its `StepCounter` ends episodes before the first reading of a sensor can arrive. Other
+            time limits can't be seen from here.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> late = ObservationDelay(1)
         >>> first = late._reset(None, TensorDict({"observation": torch.tensor([1.0, 2.0])}))
@@ -148,12 +146,7 @@ class ObservationMultiRate(CarriedStateTransform):
             default `steps_to_reading` beside the first observation; `seed`, `in_keys`, `mask_keys`,
             `complete_key` as in `ObservationMissingness`.
 
-    Raises:
-        ValueError: if a period is no whole number or under 1, a phase is negative or not under its
-            period, or their number is not that of the groups.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> rates = ObservationMultiRate([1, 2], phase=[0, 1])
         >>> data = rates._reset(None, TensorDict({"observation": torch.ones(2)}))

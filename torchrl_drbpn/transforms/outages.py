@@ -54,12 +54,7 @@ class SensorOutages(CarriedStateTransform):
             need two.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
-    Raises:
-        ValueError: if an argument is out of range, `mean_length` is under eta / (1 - eta), or an
-            index is out of range or in two groups.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> outages = SensorOutages(0.5, mean_length=20, groups=[[0, 1], [2]])
         >>> data = outages._call(TensorDict({"observation": torch.ones(1000, 4)}, [1000]))

@@ -104,7 +104,7 @@ class StuckSensors(FaultyReadings):
     this one included; at 0 where nothing of it has arrived yet.
 
     Args:
-        probability: that a working sensor gets stuck at a step, in [0, 1].
+        probability: that a working sensor gets stuck at a step, in [0, 1]; this or `onset`.
         mean_length: mean time that a sensor is stuck, steps, at least 1; None: for good.
 
     Keyword Args:
@@ -118,12 +118,7 @@ class StuckSensors(FaultyReadings):
         **keys: `groups` as in `SensorOutages`; what is in none never gets stuck. `seed`, `in_keys`,
             `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
-    Raises:
-        ValueError: if neither or both of `probability` and `onset` are given, or one is out of
-            range.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> stuck = StuckSensors(onset=1, groups=[[0]])
         >>> first = stuck._reset(None, TensorDict({"observation": torch.tensor([1.0, 2.0])}))
@@ -163,8 +158,8 @@ class SensorDrift(FaultyReadings):
     goes on growing.
 
     Args:
-        walk_std: standard deviation of a step of the walk, observation units; a number, or one per
-            component, shape `(obs,)`.
+        walk_std: standard deviation of a step of the walk, observation units, finite and not
+            negative; a number, or one per component, shape `(obs,)`.
         rate: growth of the ramp a step, observation units, of either sign, likewise.
 
     Keyword Args:
@@ -178,12 +173,7 @@ class SensorDrift(FaultyReadings):
             the first observation; `seed`, `in_keys`, `mask_keys`, `complete_key` as in
             `ObservationMissingness`.
 
-    Raises:
-        ValueError: if a number is out of range, the number of `walk_std` or `rate` is not that of
-            the components, or both `probability` and `onset` are given.
-
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> drift = SensorDrift(rate=0.5, groups=[[1]])
         >>> first = drift._reset(None, TensorDict({"observation": torch.zeros(2)}))
