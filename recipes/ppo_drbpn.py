@@ -25,7 +25,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from tqdm import tqdm
-from training.agent import add_primers, make_agent
+from training.agent import add_primers, make_agent, start_from_pretrained
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint, save_checkpoint
 from training.config import build, checked, command_line, explained, one_line, run_command
 from training.console import StopRequest, say, show
@@ -56,6 +56,8 @@ def assemble(config: DictConfig) -> Training:
     torch.manual_seed(config.seed)
     env = make_env(config)
     agent = make_agent(config, env)
+    if config.resume is None:
+        start_from_pretrained(agent)
     add_primers(env, agent)
     loss = build("loss", config.loss, agent)
     steps = build("optim", config.optim, agent.parameters())

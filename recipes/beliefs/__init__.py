@@ -45,6 +45,7 @@ class Belief:
             knows of the sensors (see the top of this file); None where it knows nothing.
         after_rollout: called with a rollout once its epochs are over, and with the first one, from
             which statistics are taken: for what is learned otherwise than by gradients.
+        pretrained: file of weights that a new run starts from, or None.
     """
 
     module: TensorDictModuleBase
@@ -52,3 +53,4 @@ class Belief:
     summary: Callable[[], Mapping[str, float]] = dict
     observing: Callable[[], TensorDictModuleBase] | None = None
     after_rollout: Callable[[TensorDictBase], None] = lambda _: None
+    pretrained: str | None = None

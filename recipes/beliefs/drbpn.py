@@ -73,6 +73,7 @@ def build(
     emission: Mapping[str, Any],
     initial: Mapping[str, Any],
     covariance: Literal["constant", "propagated"] = "constant",  # of runs that do not name it
+    pretrained: str | None = None,
 ) -> Belief:
     """Build the belief filter, see conf/belief/drbpn.yaml."""
     state = min(obs_dim, 32) if state_dim is None else state_dim
@@ -109,4 +110,5 @@ def build(
         summary=summary,
         observing=lambda: observing(module),
         after_rollout=after_rollout,
+        pretrained=pretrained,
     )

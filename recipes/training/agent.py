@@ -20,6 +20,8 @@ from pathlib import Path
 import torch
 from beliefs import Belief
 from omegaconf import DictConfig
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
@@ -36,6 +38,7 @@ from torchrl_drbpn.modules import MaskedObservationNorm
 from training.checkpoint import fitting, last_checkpoint, load_checkpoint
 from training.config import build
 from training.envs import COMPLETE
+from training.errors import UserError
 
 _SCALED_COMPLETE = f"normalized_{COMPLETE}"
 
@@ -68,6 +71,7 @@ class Agent(nn.Module):
         self.summary: Callable[[], Mapping[str, float]] = belief.summary
         self.observing: Callable[[], TensorDictModuleBase] | None = belief.observing
         self._after_rollout = belief.after_rollout
+        self.pretrained = belief.pretrained
         # Not registered a second time: its parts are above.
         self.__dict__["policy"] = TensorDictSequential(norm, belief.module, actor)
 
@@ -136,6 +140,29 @@ def load_agent(folder: Path, config: DictConfig, env: TransformedEnv) -> tuple[A
         agent.load_state_dict(state["agent"])
         frames = int(state["progress"]["frames"])
     return agent, frames
+
+
+def start_from_pretrained(agent: Agent) -> None:
+    """Give a new agent the belief and the statistics of ``belief.pretrained``, where it is named.
+
+    A file of recipes/fit.py, or the weights of a saved agent, whose heads are left out.
+    """
+    if agent.pretrained is None:
+        return
+    try:
+        weights = load_file(agent.pretrained)
+    except (SafetensorError, OSError) as error:
+        raise UserError(
+            f"`belief.pretrained` must be a file of recipes/fit.py, {agent.pretrained} can't be "
+            "read as one."
+        ) from error
+    parts = ("norm.", "belief.")
+    weights = {name: value for name, value in weights.items() if name.startswith(parts)}
+    own = {name for name in agent.state_dict() if name.startswith(parts)}
+    with fitting(agent.pretrained):
+        if different := sorted(own ^ weights.keys()):
+            raise KeyError(f"{different[0]} is in one of the two alone")
+        agent.load_state_dict(weights, strict=False)
 
 
 def add_primers(env: TransformedEnv, agent: Agent) -> None:

@@ -256,11 +256,11 @@ def explain(error: BaseException, file: str = "config") -> str:
         r"Could not (?:override|append to config\. An item is .*?|delete.*?) ?'([^']+)'", text
     ):
         name = found[1]
-        return f"`{name}` is no setting: {_nearest(name, _names(file))}"
+        return f"`{name}` is no setting: {nearest(name, _names(file))}"
     if found := re.search(r"Could not find '([^']+)'", text):
         group, _, name = found[1].rpartition("/")
         options = re.findall(r"^\t(\S+)$", text, re.MULTILINE)
-        return f"`{group}={name}` is no choice: {_nearest(name, options)}"
+        return f"`{group}={name}` is no choice: {nearest(name, options)}"
     if found := re.search(r"[Mm]issing mandatory value: (\S+)", text):
         return f"`{found[1]}` must be given."
     return one_line(error)
@@ -272,7 +272,8 @@ def one_line(error: BaseException) -> str:
     return (" ".join(text.split()) or type(error).__name__)[:400]
 
 
-def _nearest(name: str, names: Sequence[str]) -> str:
+def nearest(name: str, names: Sequence[str]) -> str:
+    """Return a hint: the nearest of some names, or all of them."""
     found = difflib.get_close_matches(name, names, 1, 0.5)
     return f"did you mean `{found[0]}`?" if found else f"there are {', '.join(sorted(names))}."
 

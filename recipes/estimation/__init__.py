@@ -1,0 +1,1 @@
+"""Fit the filter to logged data: reading logs, training, and what it is compared with."""

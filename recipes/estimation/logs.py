@@ -1,0 +1,162 @@
+"""Read a log of a robot: a table with a row a step, whose missing cells are NaN or empty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+from training.config import nearest
+from training.errors import UserError
+
+_READERS = {".csv": "read_csv", ".parquet": "read_parquet"}
+
+
+class Log(NamedTuple):
+    """Episodes side by side, each from its first row; steps behind the end of one are resets.
+
+    Args:
+        observation: shape ``(episodes, time, obs)``, 0 where missing; float64.
+        observed: bool of that shape.
+        previous_action: ``(episodes, time, action)``, 0 at the first step; float32.
+        reset: bool, ``(episodes, time)``.
+        names: of the components of an observation.
+        episodes: their names.
+    """
+
+    observation: Tensor
+    observed: Tensor
+    previous_action: Tensor
+    reset: Tensor
+    names: list[str]
+    episodes: list[str]
+
+
+def read_log(
+    path: str | None, observation: Sequence[str], action: Sequence[str], episode: str | None
+) -> Log:
+    """Read columns of a log.
+
+    An action belongs to the row in which it was taken and leads to the next row. A log without
+    actions has one that is always 0.
+
+    Args:
+        path: CSV, Parquet or NPZ; of NPZ an array of shape (rows, k) is the k columns ``name[0]``,
+            ..., and its name means all of them.
+        observation: names of columns.
+        action: names of columns.
+        episode: name of the column that tells episodes apart.
+
+    Raises:
+        UserError: for a file, a column or a cell that can't be used.
+    """
+    table = _read_table(path)
+    there = f"there are {', '.join(map(str, table.columns))}"
+    if episode is None:
+        raise UserError(f"`episode` must name the column that tells episodes apart; {there}.")
+    seen, moves = (
+        _columns(table, key, names)
+        for key, names in (("observation", observation), ("action", action))
+    )
+    (column,) = _columns(table, "episode", [episode])
+    if not seen:
+        raise UserError(
+            f"`observation` must name columns; there are {', '.join(map(str, table.columns))}."
+        )
+    everything = [*seen, *moves, column]
+    if twice := [name for name in dict.fromkeys(everything) if everything.count(name) > 1]:
+        raise UserError(f"column `{twice[0]}` is named twice: as observation, action or episode.")
+    values, actions = _numbers(table, seen), _numbers(table, moves)
+    for name, readings in zip(seen, values.T, strict=True):
+        readings = readings[~np.isnan(readings)]
+        if not len(readings):
+            raise UserError(f"`observation`: column `{name}` has no reading at all; leave it out.")
+        if np.ptp(readings) == 0:
+            raise UserError(
+                f"`observation`: column `{name}` is constant at {readings[0]:g}: there is nothing "
+                "to learn; leave it out."
+            )
+    if (empty := table[column].isna()).any():
+        raise UserError(f"`episode`: column `{column}` is empty in row {empty.argmax() + 1}.")
+    groups = list(table.groupby(column, sort=False).indices.items())
+    longest = max(len(rows) for _, rows in groups)
+    shape = len(groups), longest
+    observations = np.full((*shape, len(seen)), np.nan)
+    previous = np.zeros((*shape, max(1, len(moves))), np.float32)
+    reset = np.ones(shape, bool)
+    for i, (_, rows) in enumerate(groups):
+        rows = np.sort(rows)
+        observations[i, : len(rows)], reset[i, 1 : len(rows)] = values[rows], False
+        if moves and (gaps := np.isnan(actions[rows[:-1]]).any(1)).any():
+            raise UserError(
+                f"`action`: a cell is empty in row {rows[gaps.argmax()] + 1}; only readings may "
+                "be missing."
+            )
+        previous[i, 1 : len(rows), : len(moves)] = actions[rows[:-1]]
+    observed = ~np.isnan(observations)
+    return Log(
+        torch.from_numpy(np.where(observed, observations, 0.0)),
+        torch.from_numpy(observed),
+        torch.from_numpy(previous),
+        torch.from_numpy(reset),
+        seen,
+        [str(name) for name, _ in groups],
+    )
+
+
+def _read_table(path: str | None) -> pd.DataFrame:
+    """Read a file as a table."""
+    if path is None or not Path(path).is_file():
+        raise UserError(f"`data` must be a file with a row a step, there is no {path}.")
+    suffix = Path(path).suffix.lower()
+    if suffix not in (*_READERS, ".npz"):
+        raise UserError(f"`data` must be .csv, .parquet or .npz, got {path}.")
+    try:
+        if suffix != ".npz":
+            return getattr(pd, _READERS[suffix])(path)
+        with np.load(path, allow_pickle=False) as arrays:
+            columns = {name: arrays[name] for name in arrays.files}
+        flat: dict[str, Any] = {}
+        for name, array in columns.items():
+            if array.ndim == 2:
+                flat |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
+            else:
+                flat[name] = array
+        return pd.DataFrame(flat)
+    except ImportError as error:
+        raise UserError("`data`: Parquet needs pyarrow: pip install pyarrow.") from error
+    except Exception as error:  # whatever a parser raises
+        text = " ".join(str(error).split())[:200]
+        raise UserError(f"`data`: {path} can't be read as a table: {text}") from error
+
+
+def _columns(table: pd.DataFrame, key: str, names: Sequence[str]) -> list[str]:
+    """Return the columns that names stand for."""
+    there, found = [str(name) for name in table.columns], []
+    for name in map(str, names):
+        parts = [column for column in there if column.startswith(f"{name}[")]
+        if name not in there and not parts:
+            raise UserError(f"`{key}`: there is no column `{name}`: {nearest(name, there)}")
+        found += [name] if name in there else parts
+    return found
+
+
+def _numbers(table: pd.DataFrame, names: Sequence[str]) -> np.ndarray:
+    """Return columns as float64, NaN where a cell is empty."""
+    out = np.zeros((len(table), len(names)))
+    for i, name in enumerate(names):
+        cells = table[name]
+        numbers = pd.to_numeric(cells, errors="coerce").to_numpy(float, na_value=np.nan)
+        wrong = np.isinf(numbers) | (np.isnan(numbers) & cells.notna().to_numpy())
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise UserError(
+                f"column `{name}` holds {cells.iloc[row]!r} in row {row + 1}, which is no finite "
+                "number; leave missing cells empty."
+            )
+        out[:, i] = numbers
+    return out

@@ -1,0 +1,268 @@
+"""Fitting the filter to logged data.
+
+Specified here: what is read is the log, whatever file it is in, and what can't be used is named in
+one line; windows, scales and hidden entries do what they claim on data made here; on a known linear
+system the fit comes close to the system's own likelihood and its intervals cover; the filter that
+is written is what an agent starts from.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import oracles
+import pandas as pd
+import pytest
+import torch
+
+pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
+import recipe_tools  # finds recipes/  # isort: skip
+from evaluation_tools import configured  # isort: skip
+
+import fit as recipe
+from estimation.fitting import Sequences, fit, hide, per_entry, run, split
+from estimation.logs import read_log
+from safetensors.torch import load_file
+from test_functional_smoothing import space
+from training.errors import UserError
+
+from torchrl_drbpn import BeliefFilter, GaussianTransition
+from torchrl_drbpn.functional import filter_sequence
+
+SENSORS, TORQUES = [f"x{i}" for i in range(4)], ["u0", "u1"]
+
+
+def logged(episodes: int = 10, time: int = 60) -> tuple[oracles.LinearSystem, pd.DataFrame]:
+    """Noisy, incomplete readings of a linear system, each sensor in units of its own."""
+    system = oracles.random_system(3, 4, seed=1)
+    data = oracles.simulate(system, episodes, time, seed=1, missing_rate=0.3)
+    data.reset[:, 0] = True
+    readings = torch.where(data.observed, data.observation, torch.nan)
+    readings = readings * torch.tensor([1.0, 100.0, 1e-3, 1.0]).double() + 5
+    taken = torch.cat([data.previous_action[:, 1:], 0 * data.previous_action[:, :1]], 1)
+    flat = torch.cat([readings, 40 * taken], -1).flatten(0, 1)
+    table = pd.DataFrame(flat.numpy(), columns=[*SENSORS, *TORQUES])
+    return system, table.assign(run=np.repeat([f"run {i}" for i in range(episodes)], time))
+
+
+def write(table: pd.DataFrame, path: Path) -> Path:
+    if path.suffix == ".csv":
+        table.to_csv(path, index=False)
+    elif path.suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+        table.to_parquet(path)
+    else:
+        run = table["run"].str.removeprefix("run ").astype(int).to_numpy()
+        x, u = table[SENSORS].to_numpy(), table[TORQUES].to_numpy()
+        np.savez(path, x=x, u=u, run=run)
+    return path
+
+
+# ---------------------------------------------------------------------------------- reading a log
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
+def test_every_kind_of_file_is_the_same_log(tmp_path: Path, suffix: str) -> None:
+    _, table = logged(3, 6)
+    table = table.drop(index=17).sample(frac=1, random_state=0).sort_values("run", kind="stable")
+    expected = table[SENSORS].to_numpy()
+    names = (["x"], ["u"]) if suffix == ".npz" else (SENSORS, TORQUES)
+    log = read_log(str(write(table, tmp_path / f"log{suffix}")), *names, "run")
+    assert log.observation.shape == (3, 6, 4)
+    assert len(log.episodes) == 3
+    rows = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16]
+    found = torch.where(log.observed, log.observation, torch.nan).flatten(0, 1)[rows].numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert log.reset.tolist() == [[True, *[False] * 5]] * 2 + [[True, *[False] * 4, True]]
+    actions = table[TORQUES].to_numpy()
+    np.testing.assert_allclose(log.previous_action[1, 1:].numpy(), actions[6:11], rtol=1e-6)
+    assert not log.previous_action[:, 0].any()
+    assert not log.observed[2, 5].any()
+
+
+def broken(table: pd.DataFrame, how: str) -> pd.DataFrame:
+    table = table.copy()
+    if how == "text":
+        table["x1"] = table["x1"].astype(object)
+        table.loc[3, "x1"] = "off"
+    elif how in ("inf", "constant", "empty"):
+        table.loc[:, "x1"] = {"inf": np.inf, "constant": 2.0, "empty": np.nan}[how]
+    elif how == "all empty":
+        table[SENSORS] = np.nan
+    elif how == "action":
+        table.loc[4, "u1"] = np.nan
+    elif how == "run":
+        table.loc[4, "run"] = None
+    elif how == "one":
+        table["run"] = "the only one"
+    return table
+
+
+@pytest.mark.parametrize(
+    ("how", "changes", "line"),
+    [
+        ("", {"episode": None}, "`episode` must name the column .* there are x0, x1"),
+        ("", {"episode": "runs"}, "`episode`: there is no column `runs`: did you mean `run`?"),
+        ("", {"observation": ["x0", "y"]}, "`observation`: there is no column `y`: there are"),
+        ("", {"observation": None}, "`observation` must name columns"),
+        ("", {"action": ["x0"]}, "column `x0` is named twice"),
+        ("", {"data": "log.txt"}, "`data` must be .csv, .parquet or .npz, got"),
+        ("", {"data": "nowhere.csv"}, "`data` must be a file .* there is no nowhere.csv"),
+        ("", {"data": "broken.npz"}, "broken.npz can't be read as a table"),
+        ("", {"data": "broken.csv"}, "broken.csv can't be read as a table"),
+        ("text", {}, "column `x1` holds 'off' in row 4, which is no finite number"),
+        ("inf", {}, "column `x1` holds .*inf.* in row 1"),
+        ("constant", {}, "column `x1` is constant at 2: there is nothing to learn"),
+        ("empty", {}, "column `x1` has no reading at all"),
+        ("all empty", {}, "column `x0` has no reading at all"),
+        ("action", {}, "`action`: a cell is empty in row 5"),
+        ("run", {}, "`episode`: column `run` is empty in row 5"),
+        ("one", {}, "`episode` must tell two episodes apart"),
+        ("", {"out": None}, "`out` must be a folder"),
+        ("", {"steps": 0}, "`steps` must be at least 1, got 0"),
+        ("", {"hold_out": 1.5}, "`hold_out` must be in"),
+        ("", {"hide": 0.9, "hide_length": 2}, "`hide`, `hide_length`: `mean_length` must be"),
+        ("", {"belief": {"pretrained": "x"}}, "`belief.pretrained` is what this command makes"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, changes: dict[str, Any], line: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("log.txt", "broken.npz"):
+        Path(name).write_text("no table")
+    Path("broken.csv").write_bytes(b"\xff\xfe\x00a,b\n1")
+    write(broken(logged(3, 6)[1], how), Path("log.csv"))
+    config = configured("fit") | {
+        "data": "log.csv", "observation": SENSORS, "action": TORQUES, "episode": "run",
+        "out": "out", "steps": 1,
+    }  # fmt: skip
+    with pytest.raises(UserError, match=line) as caught:
+        recipe.run(config | changes)
+    assert "\n" not in str(caught.value)
+    assert not Path("out").exists()
+
+
+# ---------------------------------------------------------------------------------------- training
+def test_episodes_are_split_and_every_one_is_somewhere() -> None:
+    for episodes, sizes in ((2, (1, 1, 1)), (3, (1, 1, 1)), (10, (6, 2, 2)), (50, (30, 10, 10))):
+        parts = split(episodes, 0.2, seed=0)
+        assert tuple(map(len, parts)) == sizes
+        assert torch.cat(parts).unique().tolist() == list(range(episodes))
+        assert not set(parts[0].tolist()) & set(parts[2].tolist())
+
+
+def sequences(system: oracles.LinearSystem, batch: int, time: int) -> Sequences:
+    data = oracles.simulate(system, batch, time, seed=3)
+    data.reset[:, 0] = True
+    data.previous_action[:, 0] = 0
+    parts = (data.previous_action, data.observation, data.observed, data.reset)
+    return Sequences(*(x.float() if x.is_floating_point() else x for x in parts))
+
+
+def test_windows_of_a_cut_are_the_sequence_and_its_padding_is_reset() -> None:
+    data = sequences(oracles.random_system(3, 4), 2, 11)
+    windows = data.cut(4)
+    assert windows.reset.shape == (6, 4)
+    assert torch.equal(windows.observation.reshape(2, 12, 4)[:, :11], data.observation)
+    assert not windows.observed.reshape(2, 12, 4)[:, 11].any()
+    assert windows.reset.reshape(2, 12)[:, 11].all()
+
+
+def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself() -> None:
+    """With actions in units of a thousand, which the scale must take out and put back."""
+    system = oracles.random_system(3, 4, seed=1)
+    train, held = sequences(system, 40, 64), sequences(system, 40, 64)
+    data = [x._replace(previous_action=1e3 * x.previous_action) for x in (train, held)]
+    torch.manual_seed(0)
+    transition = GaussianTransition(3, 2, hidden_sizes=[], residual=False)
+    belief_filter = BeliefFilter(4, 2, 3, transition=transition)
+    before = per_entry(run(belief_filter, data[1]), data[1]).item()
+    options = {"length": 32, "batch_size": 16, "lr": 2e-2, "max_grad_norm": 10.0, "patience": 50}
+    history = list(fit(belief_filter, *data, steps=200, seed=0, weight_decay=0.0, **options))
+    after = per_entry(run(belief_filter, data[1]), data[1]).item()
+    assert after == pytest.approx(max(history), abs=2e-3)  # folding the scale changes nothing
+    model = space(system.to(torch.float32))
+    start = torch.zeros(40, 3)
+    truth = filter_sequence(model, start, *held).log_likelihood.sum() / held.observed.sum()
+    assert after > truth.item() - 0.08 > before
+
+
+def test_what_is_hidden_was_there_and_is_the_share_asked_for_in_stretches() -> None:
+    observed = torch.rand(40, 200, 5) < 0.8
+    hidden = hide(observed, 0.3, 10.0, seed=0)
+    assert not (hidden & ~observed).any()
+    assert hidden.sum() / observed.sum() == pytest.approx(0.3, abs=0.03)
+    everything = hide(torch.ones_like(observed), 0.3, 10.0, seed=0)
+    starts = (everything[:, 1:] & ~everything[:, :-1]).sum()
+    assert everything.sum() / starts == pytest.approx(10.0, rel=0.1)
+    assert torch.equal(hidden, hide(observed, 0.3, 10.0, seed=0))
+
+
+# ----------------------------------------------------------------------------------- the command
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fit")
+    data = write(logged(20, 50)[1], folder / "log.csv")
+    config = configured("fit", "belief.transition.hidden_sizes=[16]") | {
+        "data": str(data), "observation": SENSORS, "action": TORQUES, "episode": "run",
+        "out": str(folder / "out"), "steps": 150, "lr": 0.02, "batch_size": 16, "hide_length": 4,
+    }  # fmt: skip
+    assert recipe.run(config) == 0
+    return folder / "out"
+
+
+def test_the_table_holds_every_method_and_component_and_the_last_value_is_behind(
+    fitted: Path,
+) -> None:
+    assert {path.name for path in fitted.iterdir()} == {
+        "table.csv", "estimates.png", "filter.safetensors",
+    }  # fmt: skip
+    table = pd.read_csv(fitted / "table.csv").set_index(["method", "component"])
+    methods = ["filter", "linear Kalman filter", "filter, smoothed", "last value"]
+    assert list(dict.fromkeys(table.index.get_level_values(0))) == methods
+    assert set(table.index.get_level_values(1)) == {"all", *SENSORS}
+    overall = table.xs("all", level="component")
+    assert overall["rmse_std"].idxmax() == "last value"
+    assert (overall["hidden_entries"] == overall["hidden_entries"].iloc[0]).all()
+    ratio = table["rmse"] / table["rmse_std"]  # in units of the column: x1 is a hundred times x0
+    assert ratio["filter", "x1"] / ratio["filter", "x0"] > 10
+    for column, expected in (("coverage_50", 0.5), ("coverage_90", 0.9)):
+        assert overall.loc["linear Kalman filter", column] == pytest.approx(expected, abs=0.2)
+        assert np.isnan(overall.loc["last value", column])
+
+
+def agent_of(*words: str) -> dict[str, torch.Tensor]:
+    training, _ = recipe_tools.assembled("experiment=smoke", *words)
+    return training.agent.state_dict()
+
+
+def test_an_agent_starts_from_the_filter_and_its_normalisation(
+    fitted: Path, tmp_path: Path
+) -> None:
+    """InvertedPendulum has four sensors too, and one action."""
+    table = logged(4, 20)[1]
+    config = configured("fit") | {
+        "data": str(write(table, tmp_path / "log.csv")), "observation": SENSORS, "action": "u0",
+        "episode": "run", "out": str(tmp_path / "out"), "steps": 2, "hide_length": 4,
+    }  # fmt: skip
+    assert recipe.run(config) == 0
+    path = tmp_path / "out" / "filter.safetensors"
+    started = agent_of(f"belief.pretrained={path}")
+    for name, value in load_file(path).items():
+        assert torch.equal(started[name], value), name
+    assert started["norm.count"].min() > 10
+    assert recipe_tools.run(
+        tmp_path / "run", "experiment=smoke", f"belief.pretrained={path}", "total_frames=128",
+        "evaluation.final_episodes=0",
+    ) == 0  # fmt: skip
+    path.unlink()  # a run needs it once
+    from evaluation.trained import load_trained_agent
+
+    assert load_trained_agent(tmp_path / "run").frames == 128
+    assert recipe_tools.resume(tmp_path / "run", "total_frames=256") == 0
+    with pytest.raises(UserError, match="does not fit the settings of this run"):
+        agent_of(f"belief.pretrained={fitted / 'filter.safetensors'}")
+    with pytest.raises(UserError, match=r"`belief.pretrained` must be a file of recipes/fit.py"):
+        agent_of(f"belief.pretrained={path}")
