@@ -270,6 +270,25 @@ def test_the_last_smoothed_belief_of_a_filter_is_its_filtered_one_where_it_start
         module.smooth(*sequence)
 
 
+@pytest.mark.parametrize("jacobian", ["mean", "row"])
+def test_a_filter_that_propagates_ends_in_its_smoothed_belief_and_forecasts_by_its_jacobian(
+    jacobian,
+):
+    module = BeliefFilter(5, 2, 3, covariance="propagated", jacobian=jacobian, dtype=torch.float64)
+    x, observed = torch.randn(4, 6, 5).double(), torch.rand(4, 6, 5) < 0.7
+    reset = torch.zeros(4, 6, dtype=torch.bool)
+    cov = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+    action = torch.randn(4, 6, 2).double()
+    sequence = (torch.randn(4, 3).double(), cov, action, x, observed, reset)
+    filtered, smoothed = module(*sequence, return_cov=True), module.smooth(*sequence)
+    assert_equal(smoothed.mean[:, -1], filtered.mean[:, -1])
+    assert_equal(smoothed.cov[:, -1], filtered.cov[:, -1])
+    ahead = module.forecast(*sequence[:3])
+    unseen = module(*sequence[:4], torch.zeros_like(observed), reset, return_cov=True)
+    assert_equal(ahead.state.mean, unseen.mean)
+    assert_equal(ahead.state.cov, unseen.cov)
+
+
 def test_the_row_wise_jacobian_is_that_of_autograd_and_can_be_differentiated():
     problem = Problem(3, 4)
     f, mean = problem.model().transition, torch.randn(2, 3, dtype=torch.float64)

@@ -140,11 +140,10 @@ def fit(
 def _starts(belief_filter: BeliefFilter, data: Sequences, length: int) -> Belief:
     """Return the belief before each window; refresh the Jacobian of a propagated covariance."""
     out = run(belief_filter, data)
-    propagated: Any = getattr(belief_filter, "refresh_jacobian", None)
-    if propagated is not None and str(belief_filter.covariance) == "propagated":
+    if belief_filter.covariance == "propagated":
         goes_on = ~data.reset[:, 1:]
         action = data.previous_action[:, 1:][goes_on]
-        propagated(out.mean[:, :-1][goes_on], action)
+        belief_filter.refresh_jacobian(out.mean[:, :-1][goes_on], action)
     mean, cov = (
         torch.cat([torch.zeros_like(x[:, :1]), x[:, length - 1 : -1 : length]], 1).flatten(0, 1)
         for x in out[:2]

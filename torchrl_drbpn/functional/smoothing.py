@@ -1,13 +1,15 @@
 """Beliefs about the past given all readings, and about the future given none: for logged data.
 
-Both propagate the covariance through the transition's Jacobian F, whatever the filter that acts
-does with it: exact for a linear transition, the extended Kalman filter and smoother for another.
-A Q that was trained without propagation holds the share of the past already, so that it is counted
-twice here and the covariances are too wide; train with ``covariance="propagated"`` for these.
+Both propagate the covariance through the transition's Jacobian F: that of the model, or the one of
+each row where the model has none. Exact for a linear transition, the extended Kalman filter and
+smoother for another. A Q that was trained without propagation holds the share of the past already,
+which is then counted twice and makes the covariances too wide: train with
+``covariance="propagated"`` for these.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -75,8 +77,8 @@ def smooth_sequence(
         reset: bool, shape ``(*batch, time)``; True starts from the initial belief.
 
     Keyword Args:
-        jacobian: F, ``(state, state)``, or a function of (mean, action); None: that of the
-            transition at the filtered mean of every row.
+        jacobian: F, ``(state, state)``, or a function of (mean, action); None: the model's, and
+            where it has none that of the transition at the filtered mean of every row.
         emission_cov: R of every step, shape ``(*batch, time, obs, obs)``; None: the model's.
 
     Returns:
@@ -100,11 +102,13 @@ def smooth_sequence(
 
     See also :func:`filter_sequence`, which reads the past alone.
     """
-    steps = tuple(reset.shape)
-    model.check_inputs(steps, steps[:-1], mean, previous_action, observation, observed, reset)
+    steps, belief = tuple(reset.shape), _start(model, mean, cov)
+    model.check_inputs(
+        steps, steps[:-1], mean, previous_action, observation, observed, reset,
+        cov=belief.cov.to(mean.dtype),
+    )  # fmt: skip
     H, offset, dtype = model.emission_matrix, model.offset(previous_action), mean.dtype
     with without_autocast(mean):
-        belief = _start(model, mean, cov)
         filtered, predictions = [], []
         for t in range(steps[-1]):
             R = model.emission_cov if emission_cov is None else emission_cov[..., t, :, :]
@@ -224,10 +228,12 @@ def _predict(
     """Predict one step in float64; at a reset the initial belief, on which F = 0 lets nothing."""
     row, dtype = reset.unsqueeze(-1), model.emission_matrix.dtype
     mean = belief.mean.masked_fill(row, 0.0).to(dtype)
-    if jacobian is None:
-        F = row_jacobian(model.transition, mean, action)
-    else:
-        F = jacobian if isinstance(jacobian, Tensor) else jacobian(mean, action)
+    f, F = model.transition, model.transition_jacobian if jacobian is None else jacobian
+    if F is None:
+        by_row = f.jacobian if isinstance(f, TransitionMLP) else functools.partial(row_jacobian, f)
+        F = by_row(mean, action)
+    elif not isinstance(F, Tensor):
+        F = F(mean, action)
     Q = model.transition_cov
     Q = as_matrix("transition_cov", Q if isinstance(Q, Tensor) else Q(mean, action), mean.shape[-1])
     F, Q, block = F.double(), Q.double(), row.unsqueeze(-1)

@@ -353,15 +353,17 @@ class BeliefFilter(nn.Module):
         """
         if self.validate:
             refuse_readings(observation, observed)
+        model, cov = self._model(cov, previous_action)
         return smooth_sequence(
-            self.state_space(), mean, cov, previous_action, observation, observed, reset, **options
+            model, mean, cov, previous_action, observation, observed, reset, **options
         )
 
     def forecast(
         self, mean: Tensor, cov: Tensor | None, action: Tensor, **options: Any
     ) -> Forecast:
         """Predict the steps ahead; see :func:`~torchrl_drbpn.functional.forecast`."""
-        return forecast(self.state_space(), mean, cov, action, **options)
+        model, cov = self._model(cov, action)
+        return forecast(model, mean, cov, action, **options)
 
     # ------------------------------------------------------------------ checks
     def _filter_checked(
