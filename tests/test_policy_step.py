@@ -38,8 +38,11 @@ def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float
         transition = GaussianTransition(state, ACTION, cov="full", activation="tanh", dtype=dtype)
         emission = LinearGaussianEmission(obs, state, ACTION, cov="full", dtype=dtype)
     torch.manual_seed(0)
+    options = {"transition": transition, "emission": emission, "dtype": dtype}
+    if kind in ("propagated", "row"):
+        options |= {"covariance": "propagated", "jacobian": "row" if kind == "row" else "mean"}
     belief = BeliefFilterModule(
-        BeliefFilter(obs, ACTION, state, transition=transition, emission=emission, dtype=dtype),
+        BeliefFilter(obs, ACTION, state, **options),
         policy_input=policy_input,
         **keys,
     )
@@ -51,8 +54,8 @@ def first_step(belief: BeliefFilterModule):
     """The arguments of a PolicyStep at the first step of an episode."""
     observation, observed, is_init = (x[0] for x in inputs(belief.filter.obs_dim))
     action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
-    mean = torch.zeros(BATCH, belief.filter.state_dim, dtype=torch.float64)
-    return [observation, observed, action, is_init, mean, torch.zeros(BATCH, 1).long()]
+    state = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
+    return [observation, observed, action, is_init, *state]
 
 
 def inputs(obs: int, dtype: torch.dtype = torch.float64, seed: int = 0):
@@ -70,14 +73,15 @@ def inputs(obs: int, dtype: torch.dtype = torch.float64, seed: int = 0):
 def run_step(step: PolicyStep, obs: int):
     """Act through the steps; the state is put back to zero where an episode starts."""
     observation, observed, is_init = inputs(obs)
-    mean, age = step.initial_state(BATCH)
+    mean, age, *cov = step.initial_state(BATCH)
     action = torch.zeros(BATCH, ACTION, dtype=mean.dtype)
     out = []
     for t in range(TIME):
         fresh = is_init[t]
         mean, age = torch.where(fresh, 0.0, mean), torch.where(fresh, 0, age)
         action = torch.where(fresh, 0.0, action)
-        _, mean, age, action, rejected = step(observation[t], observed[t], action, fresh, mean, age)
+        given = (observation[t], observed[t], action, fresh, mean, age, *cov)
+        _, mean, age, action, rejected, *cov = step(*given)
         assert not rejected.any()
         out.append(torch.cat([action, mean], -1))
     return torch.stack(out), age
@@ -86,8 +90,7 @@ def run_step(step: PolicyStep, obs: int):
 def run_module(belief: BeliefFilterModule, head: nn.Module, norm: nn.Module | None = None):
     """The same through keys."""
     observation, observed, is_init = inputs(belief.filter.obs_dim)
-    mean = torch.zeros(BATCH, belief.filter.state_dim, dtype=torch.float64)
-    age = torch.zeros(BATCH, 1, dtype=torch.int64)
+    mean, age, *cov = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
     action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
     out = []
     for t in range(TIME):
@@ -98,16 +101,21 @@ def run_module(belief: BeliefFilterModule, head: nn.Module, norm: nn.Module | No
             previous_action=torch.where(fresh, 0.0, action), recurrent={"mean": mean, "age": age},
             batch_size=[BATCH],
         )  # fmt: skip
+        if cov:
+            data["recurrent", "cov"] = cov[0]
         with torch.no_grad():
             belief(data if norm is None else norm(data))
             action = head(data["features"])
         mean, age = data["next", "recurrent", "mean"], data["next", "recurrent", "age"]
+        cov = [data["next", "recurrent", "cov"]] if cov else []
         out.append(torch.cat([action, mean], -1))
     return torch.stack(out), age
 
 
 @pytest.mark.parametrize("policy_input", ["mean", "mean_cov"])
-@pytest.mark.parametrize("kind", ["innovation", "information", "free", "full", "network"])
+@pytest.mark.parametrize(
+    "kind", ["innovation", "information", "free", "full", "network", "propagated", "row"]
+)
 def test_a_step_equals_the_tensordict_policy(kind, policy_input):
     belief, head = make(kind, policy_input)
     step = PolicyStep(belief, head)
@@ -225,6 +233,12 @@ def test_limits_clip_the_action_and_not_what_is_fed_back():
         PolicyStep(head, head)
 
 
+def test_a_missing_covariance_is_named():
+    belief, head = make("propagated")
+    with pytest.raises(ValueError, match=r"`cov` must have shape \(3, 4, 4\) here.*got None"):
+        PolicyStep(belief, head)(*first_step(belief)[:6])
+
+
 @pytest.mark.parametrize(("place", "width"), [(0, 1), (1, 1), (2, 1), (3, ACTION), (4, 1), (5, 2)])
 def test_a_tensor_of_another_width_or_batch_is_refused_and_not_broadcast(place, width):
     belief, head = make("innovation")
@@ -236,7 +250,7 @@ def test_a_tensor_of_another_width_or_batch_is_refused_and_not_broadcast(place, 
             step(*args)
 
 
-@pytest.mark.parametrize("kind", ["innovation", "information", "network"])
+@pytest.mark.parametrize("kind", ["innovation", "information", "network", "propagated"])
 def test_export_takes_it_with_any_batch(kind):
     belief, head = make(kind)
     limit = torch.full((ACTION,), 0.05, dtype=torch.float64)

@@ -74,8 +74,9 @@ class BeliefFilter(nn.Module):
             "propagated": it is F cov F' + Q, with F the derivative of the transition, so that it
             grows while nothing arrives. Train as you act: each kind learns a Q of its own.
         jacobian: what F is: "mean", the buffer ``mean_jacobian``, which
-            :meth:`refresh_jacobian` sets (the first call of a fresh filter does), so that all steps
-            of a batch are filtered at once; "row", the derivative at each belief, step by step.
+            :meth:`refresh_jacobian` sets (the first call of a fresh filter does, at initial_mean),
+            so that all steps of a batch are filtered at once; "row", the derivative at each
+            belief, step by step.
         validate: look at values too, not only at shapes: a NaN or inf that the mask calls
             observed raises ValueError. Needs a value on the host, so it is skipped while
             compiling or exporting; switch it off under ``vmap``.
@@ -147,12 +148,13 @@ class BeliefFilter(nn.Module):
         if covariance == "propagated":
             nothing = torch.full((state_dim, state_dim), torch.nan, **place)
             self.register_buffer("mean_jacobian", nothing)
-        self._fresh = covariance == "propagated"
+        self._fresh = False
         self.initial_mean = nn.Parameter(torch.zeros(state_dim, **place))
         self.initial_noise = LearnedCovariance(
             state_dim, initial_cov, initial_std, _MIN_INITIAL_STD, name="initial_cov", **place
         )
         self._check_model()
+        self._fresh = covariance == "propagated"
 
     def reset_parameters(self) -> None:
         """Start again, the parts included where they know how."""
@@ -182,6 +184,9 @@ class BeliefFilter(nn.Module):
             R, initial_cov = self.emission.compact_cov(), self.initial_noise.compact()
         F: Tensor | Callable[[Tensor, Tensor], Tensor] | None = None
         if self.covariance == "propagated" and self.jacobian == "mean":
+            if self._fresh:
+                start = self.initial_mean.detach()
+                self.refresh_jacobian(start, start.new_zeros(self.action_dim))
             F = self.mean_jacobian
         elif self.covariance == "propagated":
             F = functools.partial(jacobian_of, self.transition)
@@ -257,8 +262,7 @@ class BeliefFilter(nn.Module):
         :func:`torchrl_drbpn.functional.saturate_innovation`; None: believe them all.
         """
         given = (mean, previous_action, observation, observed, reset)
-        model, cov = self._model(cov, previous_action)
-        believed = observation
+        model, believed = self.state_space(), observation
         if gate is not None:
             believed = saturate_innovation(model, *given, gate, cov=cov)
 
@@ -290,7 +294,8 @@ class BeliefFilter(nn.Module):
 
         Args:
             mean: filtered mean of the step before the first, shape ``(*batch, state)``.
-            cov: its covariance, shape ``(*batch, state, state)``; read where it is propagated.
+            cov: its covariance, shape ``(*batch, state, state)``; None, or not read, where it is
+                constant.
             previous_action: shape ``(*batch, time, action)``.
             observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
             observed: bool, shape ``(*batch, time, obs)``, True = arrived.
@@ -310,30 +315,21 @@ class BeliefFilter(nn.Module):
             ValueError: for a shape, a dtype or an observed value that cannot be.
         """
         given = (mean, previous_action, observation, observed, reset)
-        model, cov = self._model(cov, previous_action)
 
         def run() -> FilterOutput:
             return filter_sequence(
-                model, *given, cov=cov, use_stored_state=use_stored_state, stored_mean=stored_mean,
-                stored_cov=stored_cov, return_cov=return_cov,
+                self.state_space(), *given, cov=cov, use_stored_state=use_stored_state,
+                stored_mean=stored_mean, stored_cov=stored_cov, return_cov=return_cov,
             )  # fmt: skip
 
         return self._filter_checked(run, *given[:4])
-
-    def _model(self, cov: Tensor | None, action: Tensor) -> tuple[StateSpace, Tensor | None]:
-        """Return the model and the covariance that it reads; the first call sets the Jacobian."""
-        if self._fresh and self.jacobian == "mean":
-            start = self.initial_mean.detach()
-            self.refresh_jacobian(start.expand(*action.shape[:-1], len(start)), action)
-        return self.state_space(), None if self.covariance == "constant" else cov
 
     def predict(
         self, mean: Tensor, previous_action: Tensor, reset: Tensor, cov: Tensor | None = None
     ) -> Belief:
         """Return the belief before the observation of a step, shapes as in :meth:`step`."""
         with without_autocast(mean):
-            model, cov = self._model(cov, previous_action)
-            return predict_step(model, mean, previous_action, reset, cov)
+            return predict_step(self.state_space(), mean, previous_action, reset, cov)
 
     # ------------------------------------------------------------------ offline
     def smooth(

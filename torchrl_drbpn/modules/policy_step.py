@@ -7,11 +7,12 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from torchrl_drbpn.functional import tril_to_vector, zero_missing
+from torchrl_drbpn.functional import propagate, tril_to_vector, zero_missing
+from torchrl_drbpn.functional.gaussian import rounded_cov
 from torchrl_drbpn.functional.robust import bounded
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
-from torchrl_drbpn.modules.state_space import GaussianTransition
+from torchrl_drbpn.modules.state_space import GaussianTransition, jacobian_of
 
 __all__ = ["PolicyStep"]
 
@@ -86,7 +87,8 @@ class PolicyStep(nn.Module):
         # is small. Of a pair the first serves within an episode, the second at its first step.
         H, R = model.emission_matrix.double().clone(), model.full_emission_cov().double()
         P0, self.constant = model.full_initial_cov(), isinstance(model.transition_cov, Tensor)
-        self.information = self.constant and model.information_form
+        self.propagated = model.transition_jacobian is not None
+        self.information = self.constant and model.information_form and not self.propagated
         P = torch.stack([model.constant_cov() if self.constant else P0, P0]).double()
         self.matrix, self.noise, self.prior = nn.Buffer(H), nn.Buffer(R), nn.Buffer(P)
         self.cross, self.innovation_cov = nn.Buffer(H @ P), nn.Buffer(H @ P @ H.mT + R)
@@ -100,17 +102,19 @@ class PolicyStep(nn.Module):
             self.outer = nn.Buffer((H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2))
         self.eval()
 
-    def initial_state(self, batch: int) -> tuple[Tensor, Tensor]:
-        """Return mean and age before the first step, zeros, as the primer does.
+    def initial_state(self, batch: int) -> tuple[Tensor, ...]:
+        """Return mean, age and, if propagated, cov before the first step: zeros, as the primer.
 
         Args:
             batch: number of robots.
 
         Returns:
-            mean ``(batch, state)`` and age int64 ``(batch, 1)``.
+            mean ``(batch, state)``, age int64 ``(batch, 1)``, cov ``(batch, state, state)``.
         """
         mean = self.filter.initial_mean.new_zeros(batch, self.filter.state_dim)
-        return mean, torch.zeros(batch, 1, dtype=torch.int64, device=mean.device)
+        age = torch.zeros(batch, 1, dtype=torch.int64, device=mean.device)
+        cov = mean.new_zeros(batch, self.filter.state_dim, self.filter.state_dim)
+        return (mean, age, cov) if self.propagated else (mean, age)
 
     def forward(
         self,
@@ -120,7 +124,8 @@ class PolicyStep(nn.Module):
         is_init: Tensor,
         mean: Tensor,
         age: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        cov: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
         """Return the action, and what the next step reads.
 
         Args:
@@ -131,15 +136,18 @@ class PolicyStep(nn.Module):
             is_init: bool, shape ``(*batch, 1)``, True starts from the initial belief.
             mean: filtered mean of the step before, shape ``(*batch, state)``.
             age: updates since the reset, int64, shape ``(*batch, 1)``.
+            cov: filtered covariance of the step before, ``(*batch, state, state)``, where it is
+                propagated.
 
         Returns:
             the action within its limits ``(*batch, action)``; the next ``mean`` and ``age``; the
             action as it was chosen, which is the next ``previous_action``, since that is what the
             belief was trained on; how many readings were called observed and were no finite
-            number, int64 ``(*batch, 1)``.
+            number, int64 ``(*batch, 1)``; the next ``cov``, where it is propagated.
 
         Raises:
-            ValueError: for another shape, or a mask or ``is_init`` that is not bool.
+            ValueError: for another shape, a ``cov`` that is missing, or a mask or ``is_init`` that
+                is not bool.
         """
         filter, batch = self.filter, observation.shape[:-1]
         for name, value, width in (
@@ -153,20 +161,32 @@ class PolicyStep(nn.Module):
                     f"`{name}` must be {kind} of shape (*batch, {width}) with the batch of "
                     f"`observation` {tuple(batch)}, got {value.dtype} {tuple(value.shape)}."
                 )
+        if self.propagated and (cov is None or cov.shape != (*mean.shape, filter.state_dim)):
+            given = None if cov is None else tuple(cov.shape)
+            raise ValueError(
+                f"`cov` must have shape {(*mean.shape, filter.state_dim)} here, where the "
+                f"covariance is propagated, got {given}."
+            )
         seen = observed & (observation.abs() < torch.inf)  # False for NaN too
         x = observation if self.norm is None else self.norm.normalize(observation, seen)
-        x, H, first, cov = x.to(mean.dtype), self.matrix, is_init.unsqueeze(-1), None
+        x, H, first = x.to(mean.dtype), self.matrix, is_init.unsqueeze(-1)
+        P = None  # of each row, where it is not one of two
         if self.constant and isinstance(filter.transition, GaussianTransition):
-            moved = filter.transition.mean_network()(mean, previous_action)
+            moved, Q = filter.transition.mean_network()(mean, previous_action), self.prior[0]
         else:
-            moved, cov = filter.transition(mean, previous_action)
+            moved, P = filter.transition(mean, previous_action)
+            P = Q = P.to(H.dtype)
+        if cov is not None and self.propagated:
+            row = filter.jacobian == "row"
+            F = jacobian_of(filter.transition, mean, previous_action) if row else None
+            P = propagate(filter.mean_jacobian if F is None else F, cov.masked_fill(first, 0.0)) + Q
         m = torch.where(is_init, filter.initial_mean, moved)
-        wants_cov = self.policy_input == "mean_cov"
+        wants_cov, filtered_cov = self.propagated or self.policy_input == "mean_cov", None
         # A product and a sum, not a matmul: Inductor fuses it with what surrounds it.
         cause = torch.cat([m, previous_action], -1).unsqueeze(-2)
         expected = (self.expectation * cause).sum(-1) + self.offset
-        if cov is not None:
-            P = torch.where(first, self.prior[1], cov.to(H.dtype))
+        if P is not None:
+            P = torch.where(first, self.prior[1], P)
             cross = H @ P
             S = cross @ H.mT + self.noise
         elif not self.information or self.gate is not None:
@@ -181,24 +201,27 @@ class PolicyStep(nn.Module):
             precision = (weight @ self.outer).view(*weight.shape[:-1], *self.prior.shape[1:])
             factor, _ = torch.linalg.cholesky_ex(precision + _row(self.precision, first))
             step = torch.cholesky_solve(H.mT @ (weight.unsqueeze(-1) * residual), factor)
-            cov = torch.cholesky_inverse(factor) if wants_cov else None
+            filtered_cov = torch.cholesky_inverse(factor) if wants_cov else None
         else:
             both = seen.unsqueeze(-1) & seen.unsqueeze(-2)
             factor, _ = torch.linalg.cholesky_ex(torch.where(both, S, self.eye))
             step = cross.mT @ torch.cholesky_solve(residual, factor)
             if wants_cov:
-                P = _row(self.prior, first) if cov is None else P
+                P = _row(self.prior, first) if P is None else P
                 cross = zero_missing(cross, seen.unsqueeze(-1))
-                cov = P - cross.mT @ torch.cholesky_solve(cross, factor)
+                filtered_cov = P - cross.mT @ torch.cholesky_solve(cross, factor)
         features = filtered = m + step.squeeze(-1).to(m.dtype)
-        if wants_cov and cov is not None:
-            features = torch.cat([filtered, tril_to_vector(cov).to(m.dtype)], -1)
+        if filtered_cov is not None and self.policy_input == "mean_cov":
+            features = torch.cat([filtered, tril_to_vector(filtered_cov).to(m.dtype)], -1)
         out = self.head(features)
         chosen = action = out[0] if isinstance(out, tuple) else out
         if self.action_low is not None and self.action_high is not None:
             action = torch.clamp(chosen, self.action_low, self.action_high)
         rejected = (observed ^ seen).sum(-1, keepdim=True)
-        return action, filtered, torch.where(is_init, 0, age) + 1, chosen, rejected
+        found = (action, filtered, torch.where(is_init, 0, age) + 1, chosen, rejected)
+        if filtered_cov is None or not self.propagated:
+            return found
+        return *found, rounded_cov(filtered_cov, mean.dtype)
 
 
 def _row(pair: Tensor, first: Tensor) -> Tensor:
