@@ -28,7 +28,7 @@ from tqdm import tqdm
 from training.agent import add_primers, make_agent, start_from_pretrained
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint, save_checkpoint
 from training.config import build, checked, command_line, explained, one_line, run_command
-from training.console import StopRequest, say, show
+from training.console import BAR, StopRequest, say, show
 from training.envs import env_name, make_env
 from training.errors import DivergedError, EnvironmentFault, UserError
 from training.ppo import add_advantages, finished_episodes, rollout_metrics
@@ -199,7 +199,7 @@ def _loop(
 
     with tqdm(
         total=config.total_frames, initial=training.frames, unit="step", unit_scale=True,
-        dynamic_ncols=True, smoothing=0.1, mininterval=1.0,
+        dynamic_ncols=True, smoothing=0.1, mininterval=1.0, bar_format=BAR,
     ) as bar:  # fmt: skip
         evaluate_when_due()  # one that a signal cut short
         while training.frames < config.total_frames and not stop:

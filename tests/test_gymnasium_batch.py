@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import sys
+import warnings
 from functools import partial
 
 import gymnasium
@@ -164,6 +165,12 @@ def test_making_writes_no_log_file_and_logs_each_model_warning_once(tmp_path, ca
         GymnasiumBatchEnv("HalfCheetah-v5", 3)
     assert not any(tmp_path.iterdir())
     assert sum("settotalmass" in record.message for record in caplog.records) <= 1
+
+
+def test_an_older_version_asked_for_by_name_gives_no_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        GymnasiumBatchEnv("Walker2d-v4", 2)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -8,6 +8,7 @@ the training. A folder that can't be used is answered with one line, and what is
 from __future__ import annotations
 
 import fcntl
+import io
 import json
 import os
 import re
@@ -41,7 +42,9 @@ from recipe_tools import (  # isort: skip
 
 from evaluation.trained import evaluate_training
 from ppo_drbpn import train_rollout
+from tqdm import tqdm
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
+from training.console import BAR, show
 from training.errors import DivergedError, UserError
 from training.run_folder import Table, read_config
 
@@ -572,6 +575,19 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own(
     names = [new_folder("Hopper-v5-drbpn-seed0") for _ in range(3)]
     assert len(set(names)) == 3
     assert all(Path(name).is_dir() for name in names)
+
+
+def test_the_progress_bar_has_room_on_100_columns() -> None:
+    row = {"return": -1234.5, "missing_ratio": 0.512, "log_likelihood": -12.34,
+           "steps_per_second": 12345.6, "frames": 900_000}  # fmt: skip
+    file = io.StringIO()
+    with tqdm(total=1_000_000, unit_scale=True, ncols=100, file=file, bar_format=BAR) as bar:
+        show(bar, row)
+        bar.refresh()
+    (line,) = [part for part in file.getvalue().split("\r") if "missing 0.51" in part][-1:]
+    assert len(line.split("|")[1]) >= 10
+    assert "return -1234" in line
+    assert "12346 steps/s" in line
 
 
 @pytest.mark.slow

@@ -27,7 +27,9 @@ from analysis.statistics import interquartile_mean, interval, probability_of_imp
 from analysis.tables import derived_tables, point_kind, point_order
 from evaluation.episodes import over_episodes
 from evaluation.points import method_name, missingness_name
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import OmegaConf
+from rendering.style import legend_below, panel_grid
 from report import run
 from training.errors import UserError
 from training.run_folder import read_config, write_config
@@ -371,6 +373,20 @@ def test_an_evaluation_draws_methods_noise_and_runs_of_one_seed_apart() -> None:
     summary = episode_summary(seeds)
     assert set(summary["return"]) == {2.0}
     assert (summary.low.iloc[0], summary.high.iloc[0]) == (1.0, 3.0)
+
+
+@pytest.mark.parametrize("panels", [1, 3])
+def test_a_legend_is_as_wide_as_its_figure_and_no_wider(panels: int) -> None:
+    figure, axes = panel_grid(1, panels, (3.0, 2.0))
+    for method in range(7):
+        axes[0, 0].plot([0, 1], label=f"a method with a long name {method}")
+    legend_below(figure, 6)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    box = figure.legends[0].get_window_extent(canvas.get_renderer())
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert box.y0 >= 0
+    assert len(figure.legends) == 1
 
 
 def test_a_run_without_evaluation_or_finished_episode_is_reported(tmp_path: Path) -> None:

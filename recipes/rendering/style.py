@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 from training.run_folder import whole
@@ -46,8 +47,13 @@ def legend_below(figure: Figure, columns: int, **look: Any) -> None:
             axis.axis("off")
         for handle, text in zip(*axis.get_legend_handles_labels(), strict=True):
             found.setdefault(text, handle)
-    place: Any = {"loc": "outside lower center", "ncols": min(max(1, len(found)), columns)}
-    figure.legend(found.values(), found.keys(), frameon=False, **place, **look)
+    look |= {"loc": "outside lower center", "frameon": False}
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for ncols in range(min(max(1, len(found)), columns), 0, -1):  # as many as the figure is wide
+        legend = figure.legend(found.values(), found.keys(), ncols=ncols, **look)
+        if ncols == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        legend.remove()
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int, palette: bool = False) -> None:

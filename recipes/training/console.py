@@ -26,15 +26,19 @@ def say(text: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+# Without tqdm's own rate, so that a terminal of 100 columns has room for a bar.
+BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+
+
 def show(bar: tqdm[Any], row: Mapping[str, Any]) -> None:
     """Show frames, return, realised missing ratio, log-likelihood and speed in a progress bar."""
-    shown = (
-        ("return", "return", "{:.1f}"),
-        ("missing", "missing_ratio", "{:.3f}"),
-        ("log-lik", "log_likelihood", "{:.2f}"),
-        ("steps/s", "steps_per_second", "{:.0f}"),
-    )
-    texts = [f"{n} {form.format(row[key])}" for n, key, form in shown if row.get(key) is not None]
+    shown = {
+        "return": "return {:.4g}",
+        "missing_ratio": "missing {:.2f}",
+        "log_likelihood": "log-lik {:.2f}",
+        "steps_per_second": "{:.0f} steps/s",
+    }
+    texts = [form.format(row[key]) for key, form in shown.items() if row.get(key) is not None]
     bar.set_postfix_str(", ".join(texts), refresh=False)
     bar.update(row["frames"] - bar.n)
 

@@ -102,9 +102,11 @@ class GymnasiumBatchEnv(SimulatorBatch):
         return env.observation_space, env.action_space, limit, own
 
     def _make(self, name: str) -> gymnasium.Env[Any, Any]:
-        env = gymnasium.make(
-            name, max_episode_steps=-1, disable_env_checker=True, **self.make_kwargs
-        )
+        with warnings.catch_warnings():  # a version that was asked for by name is no mistake
+            warnings.filterwarnings("ignore", ".*is out of date", DeprecationWarning)
+            env = gymnasium.make(
+                name, max_episode_steps=-1, disable_env_checker=True, **self.make_kwargs
+            )
         # The batch itself refuses a step before the first reset.
         return env.env if isinstance(env, OrderEnforcing) else env
 
