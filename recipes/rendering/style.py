@@ -48,12 +48,15 @@ def legend_below(figure: Figure, columns: int, **look: Any) -> None:
         for handle, text in zip(*axis.get_legend_handles_labels(), strict=True):
             found.setdefault(text, handle)
     look |= {"loc": "outside lower center", "frameon": False}
-    renderer = FigureCanvasAgg(figure).get_renderer()
+    canvas: Any = FigureCanvasAgg(figure)
     for ncols in range(min(max(1, len(found)), columns), 0, -1):  # as many as the figure is wide
         legend = figure.legend(found.values(), found.keys(), ncols=ncols, **look)
-        if ncols == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
-            return
+        size = legend.get_window_extent(canvas.get_renderer())
+        if ncols == 1 or size.width <= figure.bbox.width:
+            break
         legend.remove()
+    if size.height > figure.bbox.height / 4:  # it would take the panels' room
+        figure.set_figheight(figure.get_figheight() + size.height / figure.dpi)
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int, palette: bool = False) -> None:
