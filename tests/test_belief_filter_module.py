@@ -65,6 +65,16 @@ class TestContractOfANetworkCovariance(TestContract):
         return BeliefFilterModule(belief, **kwargs)
 
 
+class TestContractOfAPropagatedCovariance(TestContract):
+    """The recurrent state holds the covariance."""
+
+    test_it_runs_in_batched_environments = None  # once is enough
+
+    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
+        belief = make_any_filter(obs, action, dtype, covariance="propagated")
+        return BeliefFilterModule(belief, **kwargs)
+
+
 def test_the_keys_are_those_of_the_contract_and_a_list_renames_them_by_position():
     module = BeliefFilterModule(make_filter())
     four = ["observation", "observed", "previous_action", "is_init"]

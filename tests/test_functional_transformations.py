@@ -14,14 +14,18 @@ from torch.autograd import forward_ad
 
 from torchrl_drbpn.functional import filter_sequence
 
-SIZES = pytest.mark.parametrize("obs", [3, 5], ids=["innovation", "information"])
+SIZES = pytest.mark.parametrize(
+    ("obs", "propagated"),
+    [(3, False), (5, False), (3, True), (5, True)],
+    ids=["innovation", "information", "propagated innovation", "propagated information"],
+)
 
 
 def total(problem: Problem):
     """A number of the start mean and of R, everything else fixed."""
     problem.leaves = {name: leaf.detach() for name, leaf in problem.leaves.items()}
     model, (_, *rest) = problem.model(), problem.arguments()
-    stored = problem.stored()
+    stored = {**problem.stored(), "cov": problem.start_cov}
 
     def run(start: Tensor, noise: Tensor) -> Tensor:
         out = filter_sequence(replace(model, emission_cov=noise), start, *rest, **stored)
@@ -31,8 +35,8 @@ def total(problem: Problem):
 
 
 @SIZES
-def test_func_grad_and_jvp_equal_autograd(obs):
-    run, given = total(Problem(3, obs, stored=True))
+def test_func_grad_and_jvp_equal_autograd(obs, propagated):
+    run, given = total(Problem(3, obs, propagated=propagated, stored=True))
     leaves = [x.clone().requires_grad_() for x in given]
     expected = torch.autograd.grad(run(*leaves), leaves)
     for a, b in zip(torch.func.grad(run, (0, 1))(*given), expected, strict=True):
@@ -46,8 +50,8 @@ def test_func_grad_and_jvp_equal_autograd(obs):
 
 
 @SIZES
-def test_vmap_over_models_and_gradients_a_sample_equal_loops(obs):
-    run, (start, noise) = total(Problem(3, obs))
+def test_vmap_over_models_and_gradients_a_sample_equal_loops(obs, propagated):
+    run, (start, noise) = total(Problem(3, obs, propagated=propagated))
     noises = torch.stack([noise, 2 * noise])
     found = torch.vmap(torch.func.grad(run, 1), in_dims=(None, 0))(start, noises)
     for a, b in zip(found, noises, strict=True):
@@ -55,8 +59,8 @@ def test_vmap_over_models_and_gradients_a_sample_equal_loops(obs):
 
 
 @SIZES
-def test_compiled_in_one_graph_it_is_the_same(obs):
-    run, given = total(Problem(3, obs, stored=True, time=3))
+def test_compiled_in_one_graph_it_is_the_same(obs, propagated):
+    run, given = total(Problem(3, obs, propagated=propagated, stored=True, time=3))
     compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
     leaves = [[x.clone().requires_grad_() for x in given] for _ in range(2)]
     values = compiled(*leaves[0]), run(*leaves[1])
@@ -68,8 +72,8 @@ def test_compiled_in_one_graph_it_is_the_same(obs):
 
 
 @SIZES
-def test_exported_it_is_the_same(obs):
-    run, given = total(Problem(3, obs, time=3))
+def test_exported_it_is_the_same(obs, propagated):
+    run, given = total(Problem(3, obs, propagated=propagated, time=3))
 
     class Module(torch.nn.Module):
         def forward(self, start: Tensor, noise: Tensor) -> Tensor:
@@ -81,12 +85,14 @@ def test_exported_it_is_the_same(obs):
 
 
 @SIZES
-def test_fake_and_meta_tensors_give_shapes(obs):
+def test_fake_and_meta_tensors_give_shapes(obs, propagated):
     mode = FakeTensorMode()
     for moved in (mode.from_tensor, lambda x: x.to("meta")):
-        problem = Problem(3, obs, batch=2, time=4)
+        problem = Problem(3, obs, propagated=propagated, batch=2, time=4)
         problem.leaves = {name: moved(leaf.detach()) for name, leaf in problem.leaves.items()}
-        problem.observed, problem.reset = moved(problem.observed), moved(problem.reset)
+        for name in ("observed", "reset", "jacobian", "start_cov"):
+            value = getattr(problem, name)
+            setattr(problem, name, None if value is None else moved(value))
         with mode if moved == mode.from_tensor else contextlib.nullcontext():
             mean, _, ll = problem.library("auto")
         assert (tuple(mean.shape), tuple(ll.shape)) == ((2, 4, 3), (2, 4))
@@ -94,11 +100,11 @@ def test_fake_and_meta_tensors_give_shapes(obs):
 
 
 @SIZES
-def test_a_tensor_class_of_its_own_and_autocast_change_nothing(obs):
+def test_a_tensor_class_of_its_own_and_autocast_change_nothing(obs, propagated):
     class Own(torch.Tensor):
         pass
 
-    problem = Problem(3, obs, dtype=torch.float32)
+    problem = Problem(3, obs, propagated=propagated, dtype=torch.float32)
     run, given = total(problem)
     expected = run(*given)
     found = run(*(x.as_subclass(Own) for x in given))
@@ -106,8 +112,9 @@ def test_a_tensor_class_of_its_own_and_autocast_change_nothing(obs):
     assert_equal(found.as_subclass(torch.Tensor), expected, 1e-3)
     model = problem.model()
     for form in ("pytorch", "auto"):
-        plain = filter_sequence(model, *problem.arguments(), return_cov=True, form=form)
+        options = {"return_cov": True, "form": form, "cov": problem.start_cov}
+        plain = filter_sequence(model, *problem.arguments(), **options)
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            cast = filter_sequence(model, *problem.arguments(), return_cov=True, form=form)
+            cast = filter_sequence(model, *problem.arguments(), **options)
         for a, b in zip(cast, plain, strict=True):
             assert torch.equal(a, b)
