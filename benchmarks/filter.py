@@ -2,7 +2,8 @@
 
 Three questions over [batch, time], 30 % of the entries missing, 2 % of the steps an episode start:
 
-- BeliefFilter, its PyTorch form and BeliefFilterModule against GRUModule and LSTMModule of width
+- BeliefFilter with a constant and a propagated covariance, their PyTorch forms and
+  BeliefFilterModule against GRUModule and LSTMModule of width
   64, at the sizes that have a bar (`--cases targets`);
 - the same over a grid of sizes (`--cases grid`);
 - how time and memory grow with one size at a time (`--cases growth`); memory is the rise of the
@@ -31,6 +32,7 @@ from torchrl_drbpn.functional import filter_sequence, native_status
 WIDTH, ACTION = 64, 6
 # (obs, state) and the ratio to GRUModule that has to be reached, at time 16 x batch 16.
 BARS = {(17, 17): 0.40, (17, 64): 0.55, (105, 32): 1.2}
+PROPAGATED_BAR = 2.5  # of a propagated covariance over the constant one, in the same form
 PYTORCH_BAR = 2.5  # of the PyTorch form at obs 17, state 17
 BASE = {"time": 16, "batch": 16, "obs": 17, "state": 17}
 GROWTH = {
@@ -72,18 +74,27 @@ def backward(module: nn.Module, loss: Tensor) -> None:
 def tensor_calls(data: TensorDict, state: int) -> Calls:
     """Make forward + backward calls of the filter on plain tensors."""
     torch.manual_seed(0)
-    module = BeliefFilter(data["observation"].shape[-1], ACTION, state)
+    obs = data["observation"].shape[-1]
+    kinds = ("constant", "propagated")
+    modules = {kind: BeliefFilter(obs, ACTION, state, covariance=kind) for kind in kinds}
+    cov = torch.eye(state).repeat(len(data), 1, 1)
     inputs = [data[key] for key in ("previous_action", "observation", "observed")]
     inputs = [data["recurrent", "mean"][:, 0], *inputs, data["is_init"].squeeze(-1)]
 
-    def run(pytorch: bool) -> None:
+    def run(kind: str, pytorch: bool) -> None:
+        module = modules[kind]
         if pytorch:
-            out = filter_sequence(module.state_space(), *inputs, form="pytorch")
+            out = filter_sequence(module.state_space(), *inputs, cov=cov, form="pytorch")
         else:
-            out = module(inputs[0], None, *inputs[1:])
+            out = module(inputs[0], cov, *inputs[1:])
         backward(module, out.mean.square().mean() - out.log_likelihood.mean())
 
-    return {"BeliefFilter": lambda: run(False), "PyTorch form": lambda: run(True)}
+    return {
+        "BeliefFilter": lambda: run("constant", False),
+        "PyTorch form": lambda: run("constant", True),
+        "propagated": lambda: run("propagated", False),
+        "propagated, PyTorch": lambda: run("propagated", True),
+    }
 
 
 def module_calls(data: TensorDict, state: int) -> Calls:
@@ -150,9 +161,13 @@ def main() -> None:
     for (time, obs, state), bar in {(4, 5, 3): None}.items() if args.quick else cases.items():
         data = make_data(time, 16, obs, state)
         calls = tensor_calls(data, state) | module_calls(data, state)
-        bars = [bar, PYTORCH_BAR if (bar, state) == (0.40, 17) else None]
+        bars = [bar, PYTORCH_BAR if (bar, state) == (0.40, 17) else None, None, None]
         title = f"time {time} x batch 16, obs {obs}, state {state}"
-        show(title, measure(calls, args, calls=3), "GRUModule", args, bar=[*bars, *[None] * 3])
+        seconds = measure(calls, args, calls=3)
+        show(title, seconds, "GRUModule", args, bar=[*bars, *[None] * 3])
+        for form, over in (("BeliefFilter", "propagated"), ("PyTorch form", "propagated, PyTorch")):
+            pair = seconds[[form, over]]
+            show(f"{title}: propagated", pair, form, args, bar=[None, PROPAGATED_BAR])
     growth = {"state": (8, 16)} if args.quick else GROWTH
     for name, values in growth.items() if "growth" in args.cases else ():
         sizes = {v: BASE | {name: v} for v in values}
