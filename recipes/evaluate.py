@@ -40,7 +40,8 @@ def run(config: dict[str, Any]) -> int:
             "evaluate each of them by itself."
         )
     output, folders = _output(config, folders), with_checkpoint(folders)
-    agents = {folder: load_trained_agent(folder, protocol.gate) for folder in folders}
+    update = protocol.robust, protocol.robust_threshold
+    agents = {folder: load_trained_agent(folder, *update) for folder in folders}
     wanted = [(f, condition) for f in folders for condition in _conditions(config, f, agents[f])]
     named = {folder.name: agent for folder, agent in agents.items()}
     table = Table(output, protocol, named, overwrite=config["overwrite"])
@@ -69,19 +70,20 @@ def _protocol(config: dict[str, Any]) -> Protocol:
         raise UserError("`modes` must hold sampled, mean or both, got none.")
     for mode in config["modes"]:
         check_mode(mode)
-    names = ("episodes", "seed", "reduction_seed", "threads", "gate")
+    names = ("episodes", "seed", "reduction_seed", "threads", "robust", "robust_threshold")
     return Protocol(**{name: config[name] for name in names})
 
 
 def _output(config: dict[str, Any], folders: Sequence[Path]) -> Path:
     name = Path(EPISODE_TABLES[config["points"] is not None])
     given = config["output"] and Path(config["output"])
-    if config["gate"] is not None:
-        name = name.with_name(f"{name.stem}-gate{config['gate']}{name.suffix}")
+    if config["robust"] is not None:
+        update = f"{config['robust']}{config['robust_threshold']}"
+        name = name.with_name(f"{name.stem}-{update}{name.suffix}")
         # Reports read the tables of these names as those of the agent as it was trained.
         if given and given.name in EPISODE_TABLES:
             raise UserError(
-                f"`output` must not be called {given.name} with a gate, as reports would read it "
+                f"`output` must not be called {given.name} with robust=, as reports would read it "
                 f"as without: take {name} or another name."
             )
     output: Path = given or (folders[0] if len(folders) == 1 else Path()) / name

@@ -46,6 +46,8 @@ class Problem:
     triangle of a symmetric matrix a formula happens to read.
     """
 
+    weight: Tensor | None = None
+
     def __init__(
         self,
         state: int,
@@ -57,6 +59,7 @@ class Problem:
         full_noise: bool = False,
         resets: bool = True,
         stored: bool = False,
+        weighted: bool = False,
         hidden: tuple[int, ...] = (5,),
         residual: bool = True,
         activation: str = "tanh",
@@ -73,6 +76,9 @@ class Problem:
             self.reset[0, 0] = self.reset[0, 2] = True
             self.reset[-1] = False
         self.use_stored = None
+        if weighted:  # small ones, ones, and zeros, which are missing entries
+            weight = 4.0 * torch.rand(self.observed.shape, generator=g) - 1.5
+            self.weight = weight.clamp(0, 1).to(dtype)
         leaves = {
             "observation": data.observation,
             "previous_action": data.previous_action,
@@ -161,14 +167,18 @@ class Problem:
         )
 
     def library(self, form: str) -> FilterOutput:
-        return self.run(form, **self.stored(), return_cov=True)
+        return self.run(form, **self.stored(), weight=self.weight, return_cov=True)
 
     def oracle(self, transition_cov: Any = None) -> tuple[Tensor, Tensor, Tensor]:
         q, p, r = self.covs()
+        noise, observed = r if self.full_noise else torch.diag(r), self.observed
+        if self.weight is not None:
+            added = noise.diagonal() * (1 / self.weight.clamp_min(1e-300) - 1)
+            noise, observed = noise + torch.diag_embed(added), observed & (self.weight > 0)
         weights, biases = self.network()
         out = oracles.filter_sequence(
             observation=self.leaves["observation"],
-            observed=self.observed,
+            observed=observed,
             previous_action=self.leaves["previous_action"],
             reset=self.reset,
             start_mean=self.leaves["start_mean"],
@@ -179,7 +189,7 @@ class Problem:
             transition=oracles.mean_network(weights, biases, self.residual, self.activation),
             transition_cov=q if transition_cov is None else transition_cov,
             matrix=self.leaves["matrix"],
-            noise=r if self.full_noise else torch.diag(r),
+            noise=noise,
             action_matrix=self.leaves["action_matrix"],
             bias=self.leaves["bias"],
             **self.stored(),

@@ -124,6 +124,7 @@ def filter_sequence(
     Where both hold, the reset wins. `transition_cov` is a matrix or a function of (mean, action),
     so is `jacobian`: with it the covariance is propagated, from `start_cov` (b, s, s) and
     `stored_cov` (b, t, s, s); what is propagated is a constant of autograd.
+    `noise` is R (n, n), or of every step one of its own (b, t, n, n).
     """
     batch, time = observed.shape[:2]
     means, covs, lls = [], [], []
@@ -148,7 +149,8 @@ def filter_sequence(
                     offset = offset + action_matrix @ action
                 if bias is not None:
                     offset = offset + bias
-            step = (observation[b, t], observed[b, t], matrix, noise, offset)
+            own = noise[b, t] if noise.ndim == 4 else noise
+            step = (observation[b, t], observed[b, t], matrix, own, offset)
             lls.append(log_likelihood(mean, cov, *step))
             mean, cov = update(mean, cov, *step)
             means.append(mean)

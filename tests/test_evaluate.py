@@ -314,8 +314,9 @@ def test_the_order_of_the_table_is_that_of_the_points_and_others_are_kept(
 
 
 def test_two_processes_give_the_numbers_of_one(drbpn: Path, tmp_path: Path) -> None:
-    one = evaluate(tmp_path / "one.csv", drbpn, points="none:0,'mcar:0.5'", gate=2)
-    two = evaluate(tmp_path / "two.csv", drbpn, points="none:0,'mcar:0.5'", gate=2, processes=2)
+    options = {"points": "none:0,'mcar:0.5'", "robust": "huber"}
+    one = evaluate(tmp_path / "one.csv", drbpn, **options)
+    two = evaluate(tmp_path / "two.csv", drbpn, **options, processes=2)
     assert one == two
     assert list(evaluate_tasks([], None, 2)) == []
 
@@ -329,7 +330,7 @@ def test_a_table_of_other_settings_is_not_mixed_with(drbpn: Path, tmp_path: Path
         ({"episodes": 3}, "with episodes 2, and 3"),
         ({"seed": 5}, "with seed 10000, and 5"),
         ({"reduction_seed": 3}, "with reduction_seed 0, and 3"),
-        ({"gate": 1}, "with method drbpn, and drbpn, gate 1"),
+        ({"robust": "imq"}, "with method drbpn, and drbpn, imq 4"),
     ):
         with pytest.raises(UserError, match=f"{what} is asked for"):
             evaluate(out, drbpn, points=points, **change)
@@ -429,23 +430,40 @@ def test_the_full_list_of_a_task_without_sensor_names_has_no_groups(
     assert "outages:0.5:20:joint" in with_names
 
 
-def test_a_gate_changes_what_spikes_do_and_its_table_has_a_name_of_its_own(
+def test_a_robust_update_changes_what_spikes_do_and_its_table_has_a_name_of_its_own(
     drbpn: Path, feedforward: Path, tmp_path: Path
 ) -> None:
     folder = shutil.copytree(drbpn, tmp_path / "run")
     points = "'spikes:1:50'"
     believed = evaluate(tmp_path / "out.csv", folder, points=points)
-    base = configured("evaluate", f"points=[{points}]", "gate=2.5") | {"run": str(folder)}
+    base = configured("evaluate", f"points=[{points}]", "robust=huber") | {"run": str(folder)}
     assert recipe.run(base | {"processes": 1, "episodes": 2, "figures": False}) == 0
-    bounded = read_rows(folder / "points-gate2.5.csv")
+    weighted = read_rows(folder / "points-huber4.0.csv")
     assert not (folder / "points.csv").exists()
     assert {row["method"] for row in believed} == {"drbpn"}
-    assert {row["method"] for row in bounded} == {"drbpn, gate 2.5"}
-    assert [r["log_likelihood"] for r in believed] != [r["log_likelihood"] for r in bounded]
-    with pytest.raises(UserError, match="`gate` must be null for belief=none, got 3"):
-        evaluate(tmp_path / "none.csv", feedforward, points="none:0", gate=3)
-    with pytest.raises(UserError, match=r"`output` must not be called points\.csv with a gate"):
+    assert {row["method"] for row in weighted} == {"drbpn, huber 4"}
+    assert [r["log_likelihood"] for r in believed] != [r["log_likelihood"] for r in weighted]
+    with pytest.raises(UserError, match="`robust` must be null for belief=none, got 'imq'"):
+        evaluate(tmp_path / "none.csv", feedforward, points="none:0", robust="imq")
+    with pytest.raises(UserError, match=r"`output` must not be called points\.csv with robust="):
         recipe.run(base | {"output": str(folder / "points.csv")})
+
+
+def test_an_agent_trained_with_a_robust_update_acts_with_it_unless_told_otherwise(
+    drbpn: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(drbpn, tmp_path / "run")
+    config = folder / "config.yaml"
+    text = config.read_text().replace("robust: null", "robust: imq")
+    config.write_text(text.replace("robust_threshold: 4.0", "robust_threshold: 2.0"))
+    settings = []
+    for robust in (None, "none", "huber"):
+        trained = load_trained_agent(folder, robust)
+        filter = trained.agent.belief.filter
+        settings.append((filter.robust, filter.robust_threshold, trained.method))
+    assert settings == [
+        ("imq", 2.0, "drbpn"), (None, 4.0, "drbpn, not robust"), ("huber", 4.0, "drbpn, huber 4"),
+    ]  # fmt: skip
 
 
 def test_a_figure_has_a_panel_a_family_and_kind_of_action(drbpn: Path, tmp_path: Path) -> None:

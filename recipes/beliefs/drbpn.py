@@ -25,6 +25,7 @@ from torchrl_drbpn import (
     GaussianTransition,
     LinearGaussianEmission,
 )
+from torchrl_drbpn.functional.robust import Robust
 
 _READ = {"observation": OBSERVATION}
 
@@ -53,7 +54,6 @@ def observing(module: BeliefFilterModule) -> TensorDictSequential:
         in_keys=_READ,
         policy_input=module.policy_input,
         out_keys=wanted,
-        gate=module.gate,
     )
     variances = TensorDictModule(
         SensorVariances(module.filter.emission),
@@ -74,6 +74,8 @@ def build(
     initial: Mapping[str, Any],
     covariance: Literal["constant", "propagated"] = "constant",  # of runs that do not name it
     pretrained: str | None = None,
+    robust: Robust | None = None,
+    robust_threshold: float = 4.0,
 ) -> Belief:
     """Build the belief filter, see conf/belief/drbpn.yaml."""
     state = min(obs_dim, 32) if state_dim is None else state_dim
@@ -88,6 +90,8 @@ def build(
         transition=GaussianTransition(state, action_dim, **moves),
         emission=LinearGaussianEmission(obs_dim, state, action_dim, **emission),
         covariance=covariance,
+        robust=robust,
+        robust_threshold=robust_threshold,
         **initial,
     )
     module = BeliefFilterModule(belief_filter, in_keys=_READ, policy_input=policy_input)

@@ -38,7 +38,8 @@ class Protocol:
     seed: int
     reduction_seed: int
     threads: int
-    gate: float | None
+    robust: str | None
+    robust_threshold: float
 
 
 class Table:
@@ -136,7 +137,7 @@ def evaluate_condition(
 def _evaluate_task(task: Task, protocol: Protocol) -> tuple[Task, pd.DataFrame]:
     torch.set_num_threads(protocol.threads)
     folder, condition, modes = task
-    trained = load_trained_agent(folder, protocol.gate)
+    trained = load_trained_agent(folder, protocol.robust, protocol.robust_threshold)
     return task, evaluate_condition(trained, condition, modes, protocol, run=folder.name)
 
 

@@ -26,23 +26,24 @@ from training.state import Training
 from evaluation.episodes import BLOCK, evaluate, over_episodes
 from evaluation.points import method_name, missingness_name
 from torchrl_drbpn import BeliefFilterModule, SensorReduction
+from torchrl_drbpn.functional.robust import check_robust
 
 WEIGHTS = "agent.safetensors"  # of an agent that was saved by itself
 
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """An agent, ready to act: configuration of its run, weights, environment steps, gate."""
+    """An agent, ready to act: configuration of its run, weights, environment steps, ``robust``."""
 
     settings: DictConfig
     agent: Agent
     frames: int
-    gate: float | None = None
+    robust: str = ""
 
     @property
     def method(self) -> str:
         """Return what it is called in tables and figures."""
-        return method_name(self.settings) + (f", gate {self.gate:g}" if self.gate else "")
+        return method_name(self.settings) + (self.robust and f", {self.robust}")
 
     @property
     def obs_dim(self) -> int:
@@ -109,13 +110,15 @@ class TrainedAgent:
         return make
 
 
-def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
+def load_trained_agent(
+    folder: Path, robust: str | None = None, threshold: float = 4.0
+) -> TrainedAgent:
     """Read the last checkpoint of a run, or an agent that recipes/save_agent.py saved.
 
     Args:
         folder: of either.
-        gate: standard deviations of the innovation, beyond which a reading counts as if at that
-            distance; None: every reading is believed.
+        robust: "huber", "imq" or "none", the update that it acts with; None: as in training.
+        threshold: where its weights begin to fall, standard deviations.
     """
     config, weights = load_config(folder), folder / WEIGHTS
     with closing(make_env(config, num_envs=1)) as env:
@@ -125,18 +128,22 @@ def load_trained_agent(folder: Path, gate: float | None = None) -> TrainedAgent:
         else:
             agent, frames = load_agent(folder, config, env)
     trained = TrainedAgent(config, agent, frames)
-    if gate is None:
+    if robust is None:
         return trained
     if not isinstance(agent.belief, BeliefFilterModule):
         raise UserError(
-            f"`gate` must be null for belief={config.belief.name}, got {gate!r}: "
+            f"`robust` must be null for belief={config.belief.name}, got {robust!r}: "
             "only belief=drbpn has a forecast of its readings to compare them with."
         )
+    update = None if robust == "none" else robust
     try:
-        agent.belief.gate = gate
+        check_robust(update, threshold)
     except ValueError as error:
         raise UserError(str(error)) from error
-    return replace(trained, gate=gate)
+    agent.belief.filter.robust, agent.belief.filter.robust_threshold = update, threshold
+    return replace(
+        trained, robust=f"{robust} {threshold:g}" if update else "every reading believed"
+    )
 
 
 def save_weights(folder: Path, trained: TrainedAgent) -> None:

@@ -53,7 +53,11 @@ from torchrl_drbpn.functional.particles import (
     resample,
     systematic_ancestors,
 )
-from torchrl_drbpn.functional.robust import saturate_innovation
+from torchrl_drbpn.functional.robust import (
+    innovation_weights,
+    robust_sequence_weights,
+    robust_weights,
+)
 from torchrl_drbpn.functional.sensor_selection import SensorSelection, select_sensors
 from torchrl_drbpn.functional.smoothing import (
     Forecast,
@@ -90,6 +94,7 @@ __all__ = [
     "forecast",
     "full_cov",
     "innovation",
+    "innovation_weights",
     "inverse_softplus",
     "log_likelihood",
     "log_mean_weight",
@@ -107,6 +112,8 @@ __all__ = [
     "predict_step",
     "propagate",
     "resample",
+    "robust_sequence_weights",
+    "robust_weights",
     "row_jacobian",
     "sample_delay",
     "sample_fault_steps",
@@ -114,7 +121,6 @@ __all__ = [
     "sample_noise",
     "sample_spikes",
     "sample_working",
-    "saturate_innovation",
     "select_sensors",
     "smooth_sequence",
     "systematic_ancestors",

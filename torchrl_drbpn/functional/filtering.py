@@ -39,10 +39,10 @@ __all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
 
 Form = Literal["auto", "pytorch", "native"]
 # observation, observed, action, reset, use_stored_state, stored_mean as (batch, time, ...), the
-# mean (batch, state) before; stored_cov and the cov before where it is propagated.
+# mean (batch, state) before; stored_cov and the cov before where it is propagated; weight.
 Sequence = tuple[
     Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor | None,
-    Tensor | None,
+    Tensor | None, Tensor | None,
 ]  # fmt: skip
 # Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step; leaves alone
 # what is there for every step.
@@ -80,6 +80,7 @@ def filter_step(
     reset: Tensor,
     *,
     cov: Tensor | None = None,
+    weight: Tensor | None = None,
     return_cov: bool = False,
     form: Form = "auto",
 ) -> FilterOutput:
@@ -101,11 +102,14 @@ def filter_step(
         (True, True)
     """
     steps = tuple(reset.shape)
-    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset, cov=cov)
+    model.check_inputs(
+        steps, steps, mean, previous_action, observation, observed, reset, cov=cov, weight=weight
+    )
     out = _filter(
         model,
         (observation.unsqueeze(-2), observed.unsqueeze(-2), previous_action.unsqueeze(-2),
-         reset.unsqueeze(-1), None, None, mean, None, cov),
+         reset.unsqueeze(-1), None, None, mean, None, cov,
+         None if weight is None else weight.unsqueeze(-2)),
         return_cov, form,
     )  # fmt: skip
     filtered = None if out.cov is None else out.cov.squeeze(-3)
@@ -124,6 +128,7 @@ def filter_sequence(
     use_stored_state: Tensor | None = None,
     stored_mean: Tensor | None = None,
     stored_cov: Tensor | None = None,
+    weight: Tensor | None = None,
     return_cov: bool = False,
     form: Form = "auto",
 ) -> FilterOutput:
@@ -146,6 +151,8 @@ def filter_sequence(
             from ``stored_mean`` (and ``stored_cov``) instead of from the sequence.
         stored_mean: shape ``(*batch, time, state)``; read where ``use_stored_state`` is True.
         stored_cov: shape ``(*batch, time, state, state)``; as ``cov``.
+        weight: w in [0, 1], shape ``(*batch, time, obs)``: reading i has the variance r_i / w_i
+            on the diagonal of R; 0 is missing. It gets no gradient.
         return_cov: whether the filtered covariances are wanted, with their gradient.
         form: "auto" runs the native form where it can; "pytorch" and "native" force one.
 
@@ -153,9 +160,9 @@ def filter_sequence(
         :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
 
     Raises:
-        ValueError: for a wrong shape or dtype, a propagated covariance that is missing, if
-            form="native" cannot run, or one of ``use_stored_state`` and ``stored_mean`` is given
-            without the other.
+        ValueError: for a wrong shape or dtype, a weight outside [0, 1], a propagated covariance
+            that is missing, if form="native" cannot run, or one of ``use_stored_state`` and
+            ``stored_mean`` is given without the other.
 
     Example:
         >>> import torch
@@ -178,11 +185,11 @@ def filter_sequence(
     steps = tuple(reset.shape)
     model.check_inputs(
         steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
-        stored_mean, stored_cov, cov,
+        stored_mean, stored_cov, cov, weight,
     )  # fmt: skip
     return _filter(
         model, (observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
-                stored_cov, cov),
+                stored_cov, cov, weight),
         return_cov, form,
     )  # fmt: skip
 
@@ -200,7 +207,10 @@ def _filter(model: StateSpace, given: Sequence, return_cov: bool, form: Form) ->
                 "covariance beside the mean."
             )
     if F is None:
-        given = (*given[:7], None, None)
+        given = (*given[:7], None, None, given[9])
+    if (weight := given[9]) is not None:
+        observed = given[1] & (weight != 0)
+        given = (given[0], observed, *given[2:9], torch.where(observed, weight.detach(), 1.0))
     *batch, time = given[3].shape
 
     def rows(x: Tensor | None) -> Tensor | None:  # not -1: there may be no step at all
@@ -209,7 +219,8 @@ def _filter(model: StateSpace, given: Sequence, return_cov: bool, form: Form) ->
     sequence: Sequence = tuple(map(rows, given))  # type: ignore[assignment]
     reason: str | None = "PyTorch was asked for"
     if form != "pytorch":
-        reason = native.unsupported_reason(model, given[0], given[2], *given[5:])
+        reason = native.unsupported_reason(model, given[0], given[2], *given[5:9])
+        reason = "it takes no weights" if reason is None and weight is not None else reason
         if reason is not None and form == "native":
             raise ValueError(f"`form` 'native' cannot run here: {reason}. Use form='auto'.")
         if not torch.compiler.is_compiling() and reason and reason == native.native_status():
@@ -219,10 +230,12 @@ def _filter(model: StateSpace, given: Sequence, return_cov: bool, form: Form) ->
         if not isinstance(model.transition_cov, Tensor) or callable(F):
             filtered, cov, ll = _run_step_by_step(model, *sequence)
         else:
-            run = native.filter_rows if reason is None else run_in_pytorch
-            filtered, cov, ll = run(model, *sequence)
+            if reason is None:
+                filtered, cov, ll = native.filter_rows(model, *sequence[:9])
+            else:
+                filtered, cov, ll = run_in_pytorch(model, *sequence)
             if return_cov and cov is None:
-                cov = filtered_cov(model, sequence[1], sequence[3])
+                cov = filtered_cov(model, sequence[1], sequence[3], sequence[9])
             elif return_cov and cov is not None:
                 cov = _differentiable_cov(model, sequence, cov)
     if cov is not None and not return_cov:
@@ -238,8 +251,10 @@ def _warn_once(reason: str) -> None:
     warnings.warn(f"the filter runs in PyTorch, several times slower: {reason}.", stacklevel=2)
 
 
-def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
-    r"""Return the filtered covariance of a constant-Q model; it depends on the masks alone.
+def filtered_cov(
+    model: StateSpace, observed: Tensor, reset: Tensor, weight: Tensor | None = None
+) -> Tensor:
+    r"""Return the filtered covariance of a constant-Q model: of the masks and weights alone.
 
     .. math:: P^+ = (I - K H) P (I - K H)' + K R K'
 
@@ -249,6 +264,7 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
         model: the state-space model, its transition_cov a tensor.
         observed: bool, shape ``(*batch, obs)``.
         reset: bool, shape ``(*batch,)``.
+        weight: in (0, 1], shape ``(*batch, obs)``, see :func:`filter_sequence`.
 
     Returns:
         Shape ``(*batch, state, state)``, symmetric positive definite.
@@ -273,19 +289,32 @@ def filtered_cov(model: StateSpace, observed: Tensor, reset: Tensor) -> Tensor:
             "filter_sequence or filter_step for it."
         )
     P = torch.where(reset[..., None, None], model.full_initial_cov(), model.constant_cov())
-    return _updated_cov(model, P, observed)
+    return _updated_cov(model, P, observed, weight)
 
 
-def _updated_cov(model: StateSpace, P: Tensor, observed: Tensor) -> Tensor:
+def _updated_cov(model: StateSpace, P: Tensor, observed: Tensor, weight: Tensor | None) -> Tensor:
     zero = torch.zeros((), dtype=P.dtype, device=P.device)
     predicted = Belief(zero.expand(P.shape[:-1]), P)
-    H, R = model.emission_matrix, model.emission_cov
+    H, R = model.emission_matrix, _weighted_noise(model, weight)
     return update(predicted, zero.expand(observed.shape), observed, H, R).cov
+
+
+def _added_noise(R: Tensor, weight: Tensor) -> Tensor:
+    """Return what weights add to the diagonal of R, float64; exactly 0 for a weight of 1."""
+    return (R if R.ndim == 1 else R.diagonal()).double() * (1.0 / weight.double() - 1.0)
+
+
+def _weighted_noise(model: StateSpace, weight: Tensor | None) -> Tensor:
+    """Return R, or of every step the matrix that its weights make of it."""
+    R = model.emission_cov
+    if weight is None:
+        return R
+    return model.full_emission_cov() + torch.diag_embed(_added_noise(R, weight))
 
 
 def _differentiable_cov(model: StateSpace, sequence: Sequence, filtered: Tensor) -> Tensor:
     """Return propagated covariances with the gradient of one step: that before is a constant."""
-    _, observed, _, reset, use_stored_state, _, _, stored_cov, cov = sequence
+    _, observed, _, reset, use_stored_state, _, _, stored_cov, cov, weight = sequence
     F = model.transition_jacobian
     assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
     before = torch.cat([cov.unsqueeze(1), filtered], 1)[:, :-1]
@@ -294,7 +323,7 @@ def _differentiable_cov(model: StateSpace, sequence: Sequence, filtered: Tensor)
     first = reset[..., None, None]
     moved = propagate(F, before.masked_fill(first, 0.0)) + model.constant_cov()
     P = torch.where(first, model.full_initial_cov().double(), moved)
-    return _updated_cov(model, P.to(filtered.dtype), observed)
+    return _updated_cov(model, P.to(filtered.dtype), observed, weight)
 
 
 # ------------------------------------------------------------------ the PyTorch form
@@ -309,12 +338,14 @@ def run_in_pytorch(
     mean: Tensor,
     stored_cov: Tensor | None = None,
     cov: Tensor | None = None,
+    weight: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None, Tensor]:
     """Filter rows ``(batch, time, ...)``; return means, propagated covariances, log-likelihoods.
 
     In float64 but for the transition: with R at its floor float32 loses most digits of a gain.
     """
-    H, dtype = model.emission_matrix.double(), mean.dtype
+    H, R, dtype = model.emission_matrix.double(), model.emission_cov.double(), mean.dtype
+    added = None if weight is None else _added_noise(R, weight)
     covs = torch.stack([model.full_initial_cov(), model.constant_cov()]).double()
 
     def choose(pair: Tensor) -> Tensor:
@@ -325,7 +356,7 @@ def run_in_pytorch(
     if model.transition_jacobian is not None:
         own = choose(covs)
         covs, filtered_covs = _run_covariances(
-            model, own, observed, reset, use_stored_state, stored_cov, cov
+            model, own, observed, added, reset, use_stored_state, stored_cov, cov
         )
         filtered_covs = rounded_cov(filtered_covs, dtype)
 
@@ -333,7 +364,7 @@ def run_in_pytorch(
             return pair
 
     gains = _information if model.information_form else _innovation
-    gain, likelihood = gains(H, model.emission_cov.double(), covs, choose, observed)
+    gain, likelihood = gains(H, R, covs, choose, observed, added)
     # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
     y = zero_missing(observation, observed).double() - model.offset(action).double()
     innovations, moves, filtered, H_t = [], [], [], H.mT
@@ -361,6 +392,7 @@ def _run_covariances(
     model: StateSpace,
     own: Tensor,
     observed: Tensor,
+    added: Tensor | None,
     reset: Tensor,
     use_stored_state: Tensor | None,
     stored_cov: Tensor | None,
@@ -375,6 +407,10 @@ def _run_covariances(
     F, time = model.transition_jacobian, reset.shape[1]
     assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
     H, R = model.emission_matrix.detach().double(), model.emission_cov.detach().double()
+    if R.ndim == 2 or not model.information_form:
+        R = model.full_emission_cov().detach().double()
+    if added is not None:
+        R = R + (added if R.ndim == 1 else torch.diag_embed(added)).detach()
     value, sigma = own.detach(), cov.detach().double()
     predicted, filtered = [], []
     # The state before a step that starts anew, or from what is stored, comes from here.
@@ -388,7 +424,7 @@ def _run_covariances(
         gained = (weight @ outer).view(value.shape)
     else:
         rows = zero_missing(H, observed.unsqueeze(-1))  # M'M H
-        noise = masked_cov(R.diag() if R.ndim == 1 else R, observed)
+        noise = masked_cov(R, observed)
     for t in range(time):
         sigma = torch.where(given[:, t, None, None], ahead[:, t], sigma)
         P = propagate(F, sigma) + value[:, t]
@@ -408,11 +444,15 @@ def _run_covariances(
     return torch.stack(predicted, 1) + (own - value), torch.stack(filtered, 1)
 
 
-def _innovation(H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor) -> Gains:
+def _innovation(
+    H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor, added: Tensor | None
+) -> Gains:
     """Return the gains K = P H' M' inv(M S M') M and the log-likelihood, obs x obs factorised."""
     full_R = R.diag() if R.ndim == 1 else R
     cross = H @ covs
-    factor, log_det = _factor(masked_cov(choose(cross @ H.mT + full_R), observed))
+    S = choose(cross @ H.mT + full_R)
+    S = S if added is None else S + torch.diag_embed(added)
+    factor, log_det = _factor(masked_cov(S, observed))
     gain = torch.cholesky_solve(zero_missing(choose(cross), observed.unsqueeze(-1)), factor).mT
 
     def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
@@ -424,16 +464,19 @@ def _innovation(H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Te
     return gain, likelihood
 
 
-def _information(H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor) -> Gains:
+def _information(
+    H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor, added: Tensor | None
+) -> Gains:
     r"""Return the gains K = inv(inv(P) + H' W H) H' W and the log-likelihood, W = diag(m / r).
 
     .. math::
         v' S^{-1} v = (v - H \delta)' W (v - H \delta) + \delta' P^{-1} \delta, \qquad
         \log|S| = \textstyle\sum_i m_i \log r_i + \log|P| + \log|P^{-1} + H' W H|
 
-    with :math:`\delta = K v`. Both terms of the quadratic form are sums of squares, so that nothing
-    cancels where R is small.
+    with :math:`\delta = K v` and r plus what is added to it. Both terms of the quadratic form are
+    sums of squares, so that nothing cancels where R is small.
     """
+    R = R if added is None else R + added
     weight = observed / R
     outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
     prior_factor, prior_log_det = _factor(covs)
@@ -446,7 +489,7 @@ def _information(H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: T
         left = zero_missing(residual - move @ H.mT, observed)
         by_prior = (prior @ move.unsqueeze(-1)).squeeze(-1)
         quadratic = (weight * left.square()).sum(-1) + (move * by_prior).sum(-1)
-        log_noise = observed.to(R.dtype) @ (R.log() + LOG_2PI)
+        log_noise = (observed * (R.log() + LOG_2PI)).sum(-1)
         return -0.5 * (quadratic + log_noise + log_det + choose(prior_log_det))
 
     return gain, likelihood
@@ -471,9 +514,10 @@ def _run_step_by_step(
     mean: Tensor,
     stored_cov: Tensor | None,
     cov: Tensor | None,
+    weight: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Filter by :mod:`.kalman` at every step; return means, covariances, log-likelihoods."""
-    H, R, offset = model.emission_matrix, model.emission_cov, model.offset(action)
+    H, R, offset = model.emission_matrix, _weighted_noise(model, weight), model.offset(action)
     means, covs, lls = [], [], []
     for t in range(reset.shape[1]):
         if use_stored_state is not None and stored_mean is not None:
@@ -482,7 +526,8 @@ def _run_step_by_step(
             if stored_cov is not None and cov is not None:
                 cov = torch.where(use.unsqueeze(-1), stored_cov[:, t], cov)
         predicted = predict_step(model, mean, action[:, t], reset[:, t], cov)
-        step = (observation[:, t], observed[:, t], H, R, offset[:, t])
+        noise = R if weight is None else R[:, t]
+        step = (observation[:, t], observed[:, t], H, noise, offset[:, t])
         lls.append(log_likelihood(predicted, *step))
         mean, cov = update(predicted, *step)
         means.append(mean)

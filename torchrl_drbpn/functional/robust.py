@@ -1,67 +1,126 @@
-"""A robust update: readings too far from their forecast are moved to a bound around it."""
+"""Weights of readings that contradict the belief and the other readings: a robust Kalman update."""
 
 from __future__ import annotations
 
 import math
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import without_autocast, zero_missing
+from torchrl_drbpn.functional.gaussian import (
+    masked_cov,
+    rounded_cov,
+    without_autocast,
+    zero_missing,
+)
 from torchrl_drbpn.functional.state_space import StateSpace, predict_step
 
-__all__ = ["bounded", "check_gate", "reading_variance", "saturate_innovation"]
+__all__ = [
+    "Robust",
+    "check_robust",
+    "innovation_weights",
+    "robust_sequence_weights",
+    "robust_weights",
+]
+
+Robust = Literal["huber", "imq"]
 
 _NORMAL_MEDIAN = 0.6744897501960817  # of |z|, z standard normal: it turns a median into a deviation
+_PASSES = 2
 
 
-def saturate_innovation(
+def innovation_weights(
+    residual: Tensor,
+    innovation_cov: Tensor,
+    noise: Tensor,
+    observed: Tensor,
+    robust: Robust,
+    threshold: float,
+) -> Tensor:
+    r"""Weigh each reading by how far it lies from what the others and the prediction say.
+
+    With z_i the leave-one-out score of a reading, sigma_i^2 its leave-one-out variance:
+
+    .. math::
+        z_i = \frac{[A^{-1} v]_i}{[A^{-1}]_{ii}\, \sigma_i}, \quad
+        \sigma_i^2 = \frac{1}{[A^{-1}]_{ii}} - q_i, \quad A = S + \mathrm{diag}(q), \quad
+        q_i \leftarrow \sigma_i^2 \begin{cases} \max(1, |z_i| / c_i) - 1 & \text{huber} \\
+        z_i^2 / (2 c_i)^2 & \text{imq} \end{cases}, \quad w_i = \frac{r_i}{r_i + q_i}
+
+    over the entries that arrived. q starts from the marginal deviations,
+    :math:`S_{ii} (\max(1, |v_i| / (c_i \sqrt{S_{ii}})) - 1)`, and is computed twice: else a reading
+    that is far off lowers the weights of those that agree with each other. c_i is ``threshold``,
+    times what the median of the other readings says S is too small by,
+    :math:`\max(1, \mathrm{med}_{j \ne i} |v_j| / \sqrt{S_{jj}} / .6745)`.
+
+    In the update that follows :math:`R_w = R + \mathrm{diag}(r_i / w_i - r_i)`: the variance of the
+    forecast error is multiplied by :math:`|z_i| / c_i` (huber: in the mean the reading counts as if
+    it lay c_i deviations off) or :math:`1 + z_i^2 / (2 c_i)^2` (imq, the inverse multiquadric
+    [Duran-Martin et al. 2024]: it counts most, c_i deviations, where it lies twice as far off, and
+    is forgotten as it goes on). The filtered covariance grows with it.
+
+    Args:
+        residual: v, shape ``(*batch, obs)``, 0 where nothing arrived.
+        innovation_cov: S, float64, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
+        noise: r, the diagonal of R, shape ``(obs,)`` or ``(*batch, obs)``.
+        observed: bool, shape ``(*batch, obs)``.
+        robust: "huber" or "imq".
+        threshold: c, standard deviations.
+
+    Returns:
+        Weights in [0, 1], shape ``(*batch, obs)``, 1 where nothing arrived.
+
+    Example:
+        >>> import torch
+        >>> S = torch.ones(5, 5).double() + 0.01 * torch.eye(5).double()  # five that agree
+        >>> v = torch.tensor([2.5, 0.0, 0.0, 0.0, 0.0]).double()  # 25 noise deviations, 2.5 of S
+        >>> w = innovation_weights(v, S, 0.01 * torch.ones(5), torch.ones(5) > 0, "huber", 3.0)
+        >>> bool(w[0] < 0.15), w[1:].tolist()
+        (True, [1.0, 1.0, 1.0, 1.0])
+    """
+    variance = innovation_cov.diagonal(dim1=-2, dim2=-1)
+    marginal = residual.abs() / variance.sqrt()
+    # Of n that arrived, the lower median of the n - 1 others is sorted[k], or the next one where
+    # the reading itself is among the first k + 1.
+    arrived = torch.where(observed, marginal, torch.inf)
+    ranked = torch.nn.functional.pad(arrived, (0, 1), value=torch.inf).sort(-1).values
+    k = ((observed.sum(-1, keepdim=True) - 2) // 2).clamp_min(0)
+    low, high = ranked.gather(-1, k), ranked.gather(-1, k + 1)
+    median = torch.where(marginal > low, low, high)
+    # No other reading: S is taken for what it says.
+    excess = torch.where(median.isfinite(), median / _NORMAL_MEDIAN, 1.0).clamp_min(1.0)
+    bound = threshold * excess
+    held = variance * ((marginal / bound).clamp_min(1.0) - 1.0)
+    for _ in range(_PASSES):
+        A = masked_cov(innovation_cov + torch.diag_embed(held), observed)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(A)[0])
+        total = 1.0 / inverse.diagonal(dim1=-2, dim2=-1)
+        # What is held back by far cancels here; no forecast is surer than the sensor's own noise.
+        forecast = torch.maximum(total - held, noise)
+        error = (inverse @ residual.unsqueeze(-1)).squeeze(-1) * total
+        score = error.abs() / forecast.sqrt() / bound
+        off = score.clamp_min(1.0) - 1.0 if robust == "huber" else (0.5 * score).square()
+        held = forecast * off
+    return torch.where(observed, noise / (noise + held), 1.0)
+
+
+def robust_weights(
     model: StateSpace,
     mean: Tensor,
     previous_action: Tensor,
     observation: Tensor,
     observed: Tensor,
     reset: Tensor,
-    gate: float,
+    *,
+    robust: Robust,
+    threshold: float = 4.0,
     cov: Tensor | None = None,
 ) -> Tensor:
-    r"""Move every reading to within ``gate`` deviations of its forecast.
+    """Weigh the readings of one step, see :func:`innovation_weights`.
 
-    .. math::
-        \tilde x_i = \hat x_i + \max(-b_i, \min(b_i, x_i - \hat x_i)), \quad
-        b_i = g\, c\, \sqrt{S_{ii}}, \quad
-        c = \max(1, \mathrm{med}_{j\ \mathrm{arrived}} |z_j| / .6745)
-
-    with :math:`z_i = (x_i - \hat x_i) / \sqrt{S_{ii}}`, :math:`\hat x = H m^- + B a + d` and
-    S = H P H' + R; P is Q, or P_0 where an episode starts. A reading within the bound stays as it
-    is, to the bit [Masreliez and Martin 1977].
-
-    What is bounded is the marginal deviation of each reading, by the diagonal of S. A reading that
-    contradicts others which it should agree with passes: among five sensors with S = 1 1' + .01 I
-    one may lie 25 of its noise deviations off and only 2.5 marginal ones.
-
-    c estimates from the readings of this step how many times too small S is. If most of them are
-    far off, the belief has diverged, and c lets them pull it back; a fixed bound, or rejection, may
-    never do so, as P does not grow meanwhile. So most of the readings that arrive must be right. A
-    single reading is its own median: it is believed unless ``gate`` is under .67. The median of an
-    even number is the lower one.
-
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before, shape ``(*batch, state)``.
-        previous_action: shape ``(*batch, action)``.
-        observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``, True = arrived.
-        reset: bool, shape ``(*batch,)``; True starts from the initial belief.
-        gate: g, standard deviations of the forecast.
-        cov: filtered covariance of the step before, ``(*batch, state, state)``; read where the
-            model propagates it.
-
-    Returns:
-        Readings, shape ``(*batch, obs)``; NaN and inf that arrived stay what they are.
-
-    Raises:
-        ValueError: if ``gate`` is not positive and finite, or for a wrong shape or dtype.
+    Arguments, result and errors are those of :func:`robust_sequence_weights`, without the dimension
+    of time.
 
     Example:
         >>> import torch
@@ -69,53 +128,116 @@ def saturate_innovation(
         >>> model = StateSpace(
         ...     lambda m, a: m, 3 * eye, eye, torch.ones(3), torch.zeros(3, 1), torch.zeros(3),
         ...     torch.zeros(3), eye)
-        >>> arrived = torch.ones(3, dtype=torch.bool)
-        >>> x = saturate_innovation(model, torch.zeros(3), torch.zeros(1),
-        ...                         torch.tensor([100.0, 1.0, -1.0]), arrived,
-        ...                         torch.tensor(False), 3.0)
-        >>> x.tolist()  # 3 deviations of sqrt(3 + 1)
-        [6.0, 1.0, -1.0]
-
-    See also :meth:`torchrl_drbpn.BeliefFilter.step`, which takes a gate.
+        >>> state = torch.zeros(3), torch.zeros(1)
+        >>> x, seen = torch.tensor([100.0, 1.0, -1.0]), torch.ones(3, dtype=torch.bool)
+        >>> w = robust_weights(model, *state, x, seen, torch.tensor(False), robust="huber")
+        >>> bool(w[0] < 0.02), w[1:].tolist()
+        (True, [1.0, 1.0])
     """
-    check_gate(gate)
-    steps = tuple(reset.shape)
-    model.check_inputs(steps, steps, mean, previous_action, observation, observed, reset, cov=cov)
-    with without_autocast(mean):
-        predicted = predict_step(model, mean, previous_action, reset, cov)
-        H = model.emission_matrix
-        expected = predicted.mean @ H.mT + model.offset(previous_action)
-        deviation = reading_variance(H, predicted.cov, model.emission_cov).sqrt()
-        return bounded(observation, observed, expected, deviation, gate)
+    weights = robust_sequence_weights(
+        model, mean, previous_action.unsqueeze(-2), observation.unsqueeze(-2),
+        observed.unsqueeze(-2), reset.unsqueeze(-1), robust=robust, threshold=threshold, cov=cov,
+    )  # fmt: skip
+    return weights.squeeze(-2)
 
 
-def bounded(
-    observation: Tensor, observed: Tensor, expected: Tensor, deviation: Tensor, gate: float
+@torch.no_grad()
+def robust_sequence_weights(
+    model: StateSpace,
+    mean: Tensor,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    *,
+    robust: Robust,
+    threshold: float = 4.0,
+    cov: Tensor | None = None,
+    use_stored_state: Tensor | None = None,
+    stored_mean: Tensor | None = None,
+    stored_cov: Tensor | None = None,
 ) -> Tensor:
-    """Saturate innovations whose forecasts are known; all shapes ``(*batch, obs)``."""
-    # Before any arithmetic: a NaN under a False mask would spoil gradients.
-    observation = zero_missing(observation, observed)
-    score = ((observation - expected) / deviation).abs()
-    typical = score.masked_fill(~observed, torch.nan).nanmedian(-1, keepdim=True).values
-    # Without any reading the median is NaN, and there is nothing to bound.
-    excess = (typical / _NORMAL_MEDIAN).nan_to_num(1.0).clamp_min(1.0)
-    bound = gate * excess * deviation
-    near = torch.clamp(observation, expected - bound, expected + bound)
-    # The filter refuses an infinite reading that is called observed; a clamp would hide it.
-    return torch.where(observation.isinf(), observation, near)
+    """Weigh the readings of a sequence, step by step: each from the belief that the last one left.
+
+    Args:
+        model: the state-space model.
+        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
+        previous_action: shape ``(*batch, time, action)``.
+        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, time, obs)``.
+        reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
+
+    Keyword Args:
+        robust: "huber" or "imq".
+        threshold: c, standard deviations.
+        cov: see :func:`filter_sequence`, as the three below.
+        use_stored_state: with ``stored_mean``.
+        stored_mean: with ``stored_cov`` where the covariance is propagated.
+        stored_cov: shape ``(*batch, time, state, state)``.
+
+    Returns:
+        Weights for :func:`filter_sequence`, shape ``(*batch, time, obs)``, without gradient.
+
+    Raises:
+        ValueError: for a wrong shape or dtype, another ``robust``, a ``threshold`` that is not
+            positive and finite.
+
+    Example:
+        >>> import torch
+        >>> eye = torch.eye(2)
+        >>> model = StateSpace(
+        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
+        ...     torch.zeros(2), eye)
+        >>> x = torch.zeros(4, 10, 2)
+        >>> w = robust_sequence_weights(
+        ...     model, torch.zeros(4, 2), torch.zeros(4, 10, 1), x, x == 0, x[..., 0] > 0,
+        ...     robust="imq")
+        >>> torch.equal(w, torch.ones_like(x))
+        True
+    """
+    check_robust(robust, threshold)
+    steps = tuple(reset.shape)
+    model.check_inputs(
+        steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
+        stored_mean, stored_cov, cov,
+    )  # fmt: skip
+    with without_autocast(mean):
+        H, R = model.emission_matrix.double(), model.full_emission_cov().double()
+        noise, offset = R.diagonal(), model.offset(previous_action).double()
+        filled = zero_missing(observation, observed).double()
+        cov, weights = None if model.transition_jacobian is None else cov, []
+        for t in range(steps[-1]):
+            if use_stored_state is not None and stored_mean is not None:
+                use = use_stored_state[..., t, None]
+                mean = torch.where(use, stored_mean[..., t, :], mean)
+                if stored_cov is not None and cov is not None:
+                    cov = torch.where(use.unsqueeze(-1), stored_cov[..., t, :, :], cov)
+            action, seen = previous_action[..., t, :], observed[..., t, :]
+            m, P = (x.double() for x in predict_step(model, mean, action, reset[..., t], cov))
+            cross = H @ P
+            S = cross @ H.mT + R
+            v = zero_missing(filled[..., t, :] - m @ H.mT - offset[..., t, :], seen)
+            weights.append(innovation_weights(v, S, noise, seen, robust, threshold).to(mean.dtype))
+            if t + 1 == steps[-1]:
+                break
+            A = masked_cov(S + torch.diag_embed(noise / weights[-1] - noise), seen)
+            cross = zero_missing(cross, seen.unsqueeze(-1))
+            solved = torch.cholesky_solve(cross, torch.linalg.cholesky_ex(A)[0])
+            mean = (m + (v.unsqueeze(-2) @ solved).squeeze(-2)).to(mean.dtype)
+            cov = None if cov is None else rounded_cov(P - cross.mT @ solved, mean.dtype)
+    return torch.stack(weights, -2) if weights else torch.ones_like(observation)
 
 
-def reading_variance(emission: Tensor, cov: Tensor, noise: Tensor) -> Tensor:
-    """Return the diagonal of H P H' + R; R a matrix, or its diagonal."""
-    own = noise if noise.ndim == 1 else noise.diagonal()
-    return ((emission @ cov) * emission).sum(-1) + own
-
-
-def check_gate(gate: float) -> None:
-    """Raise unless a gate is a positive, finite number."""
-    number = isinstance(gate, (int, float)) and not isinstance(gate, bool)
-    if not number or not 0 < gate < math.inf:
+def check_robust(robust: Any, threshold: Any) -> None:
+    """Raise unless the update is one of those there are, its threshold a positive number."""
+    if robust is not None and robust not in get_args(Robust):
         raise ValueError(
-            "`gate` must be a positive, finite number of standard deviations of the innovation, "
-            f"got {gate!r}; 3 is usual, None is no gate."
+            f"`robust` must be one of {', '.join(get_args(Robust))}, or None to believe every "
+            f"reading, got {robust!r}."
+        )
+    number = isinstance(threshold, (int, float)) and not isinstance(threshold, bool)
+    if not number or not 0 < threshold < math.inf:
+        raise ValueError(
+            "`robust_threshold` must be a positive, finite number of standard deviations, got "
+            f"{threshold!r}; 4 is usual."
         )

@@ -210,6 +210,7 @@ class StateSpace:
         stored_mean: Tensor | None = None,
         stored_cov: Tensor | None = None,
         cov: Tensor | None = None,
+        weight: Tensor | None = None,
     ) -> None:
         """Raise unless means and cov are ``(*start, n)``, others ``(*steps, n)``, of its dtype."""
         obs, state, action = self.obs_dim, self.state_dim, self.action_dim
@@ -222,6 +223,7 @@ class StateSpace:
             ("mean", mean, own, " state", (*start, state)),
             ("use_stored_state", use_stored_state, flag, "", steps),
             ("stored_mean", stored_mean, own, " state", (*steps, state)),
+            ("weight", weight, own, " obs", (*steps, obs)),
             ("cov", cov, own, " state, state", (*start, state, state)),
             ("stored_cov", stored_cov, own, " state, state", (*steps, state, state)),
         )
@@ -237,6 +239,17 @@ class StateSpace:
             raise ValueError(
                 f"`{name}` must be {kinds[0]} of shape (*batch,{word}) = {shape}, got {kinds[1]} "
                 f"{tuple(value.shape)}. {hint}"
+            )
+        if weight is None or torch.compiler.is_compiling() or weight.is_meta:
+            return
+        try:
+            outside = bool(((weight < 0) | (weight > 1)).any())
+        except RuntimeError:  # under vmap no number reaches the host
+            return
+        if outside:
+            raise ValueError(
+                f"`weight` must lie in [0, 1], got {weight.min():.3g} to {weight.max():.3g}: 1 "
+                "believes a reading, 0 drops it."
             )
 
     @property

@@ -18,10 +18,12 @@ from torchrl_drbpn.functional import (
     filter_step,
     forecast,
     predict_step,
-    saturate_innovation,
+    robust_sequence_weights,
+    robust_weights,
     smooth_sequence,
 )
 from torchrl_drbpn.functional.gaussian import NotPositiveDefiniteError, without_autocast
+from torchrl_drbpn.functional.robust import Robust, check_robust
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
@@ -77,6 +79,10 @@ class BeliefFilter(nn.Module):
             :meth:`refresh_jacobian` sets (the first call of a fresh filter does, at initial_mean),
             so that all steps of a batch are filtered at once; "row", the derivative at each
             belief, step by step.
+        robust: "huber" or "imq" gives a reading that contradicts the prediction and the other
+            readings a weight under 1 (:func:`~torchrl_drbpn.functional.innovation_weights`), in
+            acting and in training alike; None believes every reading. May be set later.
+        robust_threshold: standard deviations off at which the weights begin to fall.
         validate: look at values too, not only at shapes: a NaN or inf that the mask calls
             observed raises ValueError. Needs a value on the host, so it is skipped while
             compiling or exporting; switch it off under ``vmap``.
@@ -113,6 +119,8 @@ class BeliefFilter(nn.Module):
         initial_cov: CovKind = "diag",
         covariance: Literal["constant", "propagated"] = "constant",
         jacobian: Literal["mean", "row"] = "mean",
+        robust: Robust | None = None,
+        robust_threshold: float = 4.0,
         validate: bool = True,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
@@ -144,7 +152,9 @@ class BeliefFilter(nn.Module):
                         f"`{part}` has {name}={its}, the filter {name}={mine}: build both with "
                         "the same dimensions."
                     )
+        check_robust(robust, robust_threshold)
         self.covariance, self.jacobian, self.validate = covariance, jacobian, validate
+        self.robust, self.robust_threshold = robust, robust_threshold
         if covariance == "propagated":
             nothing = torch.full((state_dim, state_dim), torch.nan, **place)
             self.register_buffer("mean_jacobian", nothing)
@@ -253,25 +263,18 @@ class BeliefFilter(nn.Module):
         reset: Tensor,
         *,
         return_cov: bool = False,
-        gate: float | None = None,
     ) -> FilterOutput:
-        """Filter one step; arguments, result and errors as in :meth:`forward`, without time.
-
-        ``gate``: readings further than about this many standard deviations from their forecast
-        are filtered as if they lay at that distance, and the likelihood is that of these, see
-        :func:`torchrl_drbpn.functional.saturate_innovation`; None: believe them all.
-        """
+        """Filter one step; arguments, result and errors as in :meth:`forward`, without time."""
         given = (mean, previous_action, observation, observed, reset)
-        model, believed = self.state_space(), observation
-        if gate is not None:
-            believed = saturate_innovation(model, *given, gate, cov=cov)
+        model = self.state_space()
 
-        # The error is about the readings as they arrived, not as they were moved.
         def run() -> FilterOutput:
-            return filter_step(
-                model, mean, previous_action, believed, observed, reset, cov=cov,
-                return_cov=return_cov,
-            )  # fmt: skip
+            weight = None
+            if (robust := self.robust) is not None:
+                weight = robust_weights(
+                    model, *given, cov=cov, robust=robust, threshold=self.robust_threshold
+                )
+            return filter_step(model, *given, cov=cov, weight=weight, return_cov=return_cov)
 
         return self._filter_checked(run, *given[:4])
 
@@ -315,12 +318,19 @@ class BeliefFilter(nn.Module):
             ValueError: for a shape, a dtype or an observed value that cannot be.
         """
         given = (mean, previous_action, observation, observed, reset)
+        model = self.state_space()
+        stored: dict[str, Any] = {
+            "cov": cov, "use_stored_state": use_stored_state, "stored_mean": stored_mean,
+            "stored_cov": stored_cov,
+        }  # fmt: skip
 
         def run() -> FilterOutput:
-            return filter_sequence(
-                self.state_space(), *given, cov=cov, use_stored_state=use_stored_state,
-                stored_mean=stored_mean, stored_cov=stored_cov, return_cov=return_cov,
-            )  # fmt: skip
+            weight = None
+            if (robust := self.robust) is not None:
+                weight = robust_sequence_weights(
+                    model, *given, **stored, robust=robust, threshold=self.robust_threshold
+                )
+            return filter_sequence(model, *given, **stored, weight=weight, return_cov=return_cov)
 
         return self._filter_checked(run, *given[:4])
 
@@ -349,17 +359,15 @@ class BeliefFilter(nn.Module):
         """
         if self.validate:
             refuse_readings(observation, observed)
-        model, cov = self._model(cov, previous_action)
         return smooth_sequence(
-            model, mean, cov, previous_action, observation, observed, reset, **options
+            self.state_space(), mean, cov, previous_action, observation, observed, reset, **options
         )
 
     def forecast(
         self, mean: Tensor, cov: Tensor | None, action: Tensor, **options: Any
     ) -> Forecast:
         """Predict the steps ahead; see :func:`~torchrl_drbpn.functional.forecast`."""
-        model, cov = self._model(cov, action)
-        return forecast(model, mean, cov, action, **options)
+        return forecast(self.state_space(), mean, cov, action, **options)
 
     # ------------------------------------------------------------------ checks
     def _filter_checked(

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchrl_drbpn.functional import innovation, tril_to_vector
 from torchrl_drbpn.functional.gaussian import without_autocast
-from torchrl_drbpn.functional.robust import check_gate
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 
@@ -59,16 +58,11 @@ class BeliefFilterModule(RecurrentBeliefModule):
         policy_input: what ``features`` holds, for policy and value to read (eq. 11 [DRBPN]):
             "mean", or "mean_cov" (lower triangle of the filtered covariance behind the mean).
         default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
-        gate: for a trained agent whose sensors may give wrong readings: those further than about
-            this many standard deviations from their prediction are moved to that distance
-            (:func:`functional.saturate_innovation`), and ``("belief", "log_likelihood")`` is that
-            of the moved readings. None: no reading is moved. One step at a time only; the
-            attribute ``gate`` may be set later.
 
     Raises:
         TypeError: if keys are neither a list nor a dict.
-        ValueError: for a key list of another length, an unknown name, a key given twice, an
-            unknown choice, or a gate that is not positive and finite.
+        ValueError: for a key list of another length, an unknown name, a key given twice or an
+            unknown choice.
         KeyError: at a call, if an entry is absent; the message says who writes it.
 
     Example:
@@ -101,7 +95,6 @@ class BeliefFilterModule(RecurrentBeliefModule):
         out_keys: Keys = None,
         policy_input: Literal["mean", "mean_cov"] = "mean",
         default_recurrent_mode: bool | None = None,
-        gate: float | None = None,
     ) -> None:
         if policy_input not in ("mean", "mean_cov"):
             raise ValueError(f"`policy_input` must be 'mean' or 'mean_cov', got {policy_input!r}.")
@@ -112,7 +105,7 @@ class BeliefFilterModule(RecurrentBeliefModule):
             filter, state, _DEFAULT, _OPTIONAL, in_key, in_keys, out_key, out_keys,
             default_recurrent_mode,
         )  # fmt: skip
-        self.policy_input, self.gate = policy_input, gate
+        self.policy_input = policy_input
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -126,13 +119,7 @@ class BeliefFilterModule(RecurrentBeliefModule):
         readings = (given.previous_action, given.observation, given.observed, given.reset)
         want_cov = ("belief", "cov") in self._out or self.policy_input == "mean_cov"
         if not self.recurrent_mode:
-            out = self.filter.step(mean, cov, *readings, return_cov=want_cov, gate=self.gate)
-        elif self.gate is not None:
-            raise ValueError(
-                f"`gate` is {self.gate:g}, and the mode is recurrent: a gate is for a trained "
-                "agent and works one step at a time. Train without one (gate = None) and set it "
-                "afterwards."
-            )
+            out = self.filter.step(mean, cov, *readings, return_cov=want_cov)
         else:
             use, time = given.use_stored_state, given.reset.ndim - 1
 
@@ -165,17 +152,6 @@ class BeliefFilterModule(RecurrentBeliefModule):
                 ).cov
         after = [out.mean] if cov is None or out.cov is None else [out.mean, out.cov]
         return self._write(tensordict, results, (*after, given.age + 1))
-
-    @property
-    def gate(self) -> float | None:
-        """Standard deviations beyond which an innovation is saturated; None: nowhere."""
-        return self._gate
-
-    @gate.setter
-    def gate(self, gate: float | None) -> None:
-        if gate is not None:
-            check_gate(gate)
-        self._gate = gate
 
     @property
     def feature_dim(self) -> int:

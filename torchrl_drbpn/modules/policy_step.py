@@ -7,9 +7,13 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from torchrl_drbpn.functional import propagate, tril_to_vector, zero_missing
+from torchrl_drbpn.functional import (
+    innovation_weights,
+    propagate,
+    tril_to_vector,
+    zero_missing,
+)
 from torchrl_drbpn.functional.gaussian import rounded_cov
-from torchrl_drbpn.functional.robust import bounded
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
 from torchrl_drbpn.modules.state_space import GaussianTransition, jacobian_of
@@ -30,7 +34,7 @@ class PolicyStep(nn.Module):
     "freezing" and "max_autotune" together compile the matrix products too.
 
     Args:
-        belief: the belief module; its ``gate`` is kept.
+        belief: the belief module; its filter's ``robust`` is kept.
         head: maps ``features`` ``(*batch, features)`` to the action ``(*batch, action)``, or to a
             tuple that begins with it, such as (loc, scale).
 
@@ -75,7 +79,7 @@ class PolicyStep(nn.Module):
             )
         if (action_low is None) != (action_high is None):
             raise ValueError("`action_low` and `action_high` must be given together or not at all.")
-        self.policy_input, self.gate = belief.policy_input, belief.gate
+        self.policy_input = belief.policy_input
         self.norm, self.filter, self.head = copy.deepcopy((norm, belief.filter, head))
         self.requires_grad_(False)
         limits = [
@@ -189,15 +193,19 @@ class PolicyStep(nn.Module):
             P = torch.where(first, self.prior[1], P)
             cross = H @ P
             S = cross @ H.mT + self.noise
-        elif not self.information or self.gate is not None:
+        elif not self.information or filter.robust is not None:
             cross, S = _row(self.cross, first), _row(self.innovation_cov, first)
-        if self.gate is not None:
-            deviation = S.diagonal(dim1=-2, dim2=-1).sqrt().to(x.dtype)
-            x = bounded(x, seen, expected, deviation, self.gate)
-        residual = zero_missing(x - expected, seen).to(H.dtype).unsqueeze(-1)
+        residual, trust = zero_missing(x - expected, seen).to(H.dtype), seen.to(H.dtype)
+        if filter.robust is not None:
+            noise = self.noise.diagonal()
+            trust = trust * innovation_weights(
+                residual, S, noise, seen, filter.robust, filter.robust_threshold
+            )
+            S = S + torch.diag_embed(zero_missing(noise / trust - noise, seen))
+        residual = residual.unsqueeze(-1)
         # cholesky_ex: its plain form looks at a value on the host to raise.
         if self.information:
-            weight = seen * self.weight
+            weight = trust * self.weight
             precision = (weight @ self.outer).view(*weight.shape[:-1], *self.prior.shape[1:])
             factor, _ = torch.linalg.cholesky_ex(precision + _row(self.precision, first))
             step = torch.cholesky_solve(H.mT @ (weight.unsqueeze(-1) * residual), factor)
