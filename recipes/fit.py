@@ -56,6 +56,8 @@ def run(config: dict[str, Any]) -> int:
     check_limits(config, _LIMITS)
     if config["belief"].get("pretrained"):
         raise UserError("`belief.pretrained` is what this command makes; leave it out.")
+    if config["belief"].get("mask_model"):
+        raise UserError("`belief.mask_model` must be false: what is hidden here has no reason.")
     if config["out"] is None or Path(config["out"]).is_file():
         raise UserError(f"`out` must be a folder, such as fits/arm, got {config['out']}.")
     log = read_log(

@@ -76,6 +76,7 @@ def build(
     pretrained: str | None = None,
     robust: Robust | None = None,
     robust_threshold: float = 4.0,
+    mask_model: bool = False,
 ) -> Belief:
     """Build the belief filter, see conf/belief/drbpn.yaml."""
     state = min(obs_dim, 32) if state_dim is None else state_dim
@@ -92,6 +93,7 @@ def build(
         covariance=covariance,
         robust=robust,
         robust_threshold=robust_threshold,
+        mask_model=mask_model,
         **initial,
     )
     module = BeliefFilterModule(belief_filter, in_keys=_READ, policy_input=policy_input)

@@ -23,6 +23,7 @@ from torchrl_drbpn.functional.gaussian import (
     tril_to_vector,
     zero_missing,
 )
+from torchrl_drbpn.functional.informative import MaskModel, update_by_mask
 from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
 from torchrl_drbpn.functional.missingness import (
     MissingnessMechanism,
@@ -73,6 +74,7 @@ __all__ = [
     "DiagonalGaussian",
     "FilterOutput",
     "Forecast",
+    "MaskModel",
     "MissingnessMechanism",
     "OutageRates",
     "ParticleModel",
@@ -126,5 +128,6 @@ __all__ = [
     "systematic_ancestors",
     "tril_to_vector",
     "update",
+    "update_by_mask",
     "zero_missing",
 ]

@@ -9,7 +9,7 @@ a whole minibatch are one batched computation ahead of the mean recurrence. Wher
 propagated by one Jacobian they depend on masks and episode starts: their recursion runs before,
 without gradient. The gain comes from what is cheaper to factorise: S = H P H' + R, obs x obs, or
 the precision inv(P) + H' inv(R) H, state x state (diagonal R, obs > state). A Q or a Jacobian that
-depends on the state takes :mod:`.kalman` step by step.
+depends on the state, or a model of the mask, takes :mod:`.kalman` step by step.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from torchrl_drbpn.functional.gaussian import (
     without_autocast,
     zero_missing,
 )
+from torchrl_drbpn.functional.informative import update_by_mask
 from torchrl_drbpn.functional.kalman import log_likelihood, update
 from torchrl_drbpn.functional.state_space import StateSpace, predict_step, propagate
 
@@ -227,7 +228,7 @@ def _filter(model: StateSpace, given: Sequence, return_cov: bool, form: Form) ->
             _warn_once(reason)
     with without_autocast(given[6]):
         cov: Tensor | None
-        if not isinstance(model.transition_cov, Tensor) or callable(F):
+        if not isinstance(model.transition_cov, Tensor) or callable(F) or model.mask_model:
             filtered, cov, ll = _run_step_by_step(model, *sequence)
         else:
             if reason is None:
@@ -283,9 +284,9 @@ def filtered_cov(
         >>> torch.allclose(cov, torch.diag(torch.tensor([0.75, 1.0])))
         True
     """
-    if model.transition_jacobian is not None:
+    if model.transition_jacobian is not None or model.mask_model is not None:
         raise ValueError(
-            "`model` propagates its covariance, which depends on the whole past: ask "
+            "`model` has a covariance that depends on the whole past: ask "
             "filter_sequence or filter_step for it."
         )
     P = torch.where(reset[..., None, None], model.full_initial_cov(), model.constant_cov())
@@ -529,7 +530,11 @@ def _run_step_by_step(
         noise = R if weight is None else R[:, t]
         step = (observation[:, t], observed[:, t], H, noise, offset[:, t])
         lls.append(log_likelihood(predicted, *step))
-        mean, cov = update(predicted, *step)
+        belief = update(predicted, *step)
+        if model.mask_model is not None:
+            belief, ll = update_by_mask(belief, *step, model.mask_model)
+            lls[-1] = lls[-1] + ll
+        mean, cov = belief
         means.append(mean)
         covs.append(cov)
     if not means:

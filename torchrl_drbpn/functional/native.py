@@ -68,6 +68,8 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     f, Q = model.transition, model.transition_cov
     if not isinstance(f, TransitionMLP) or not isinstance(Q, Tensor):
         return "it takes a TransitionMLP with a constant transition_cov"
+    if model.mask_model is not None:
+        return "its belief learns from the mask"
     F = model.transition_jacobian
     if callable(F) or (F is not None and model.emission_cov.ndim == 2):
         return "it propagates a covariance by one Jacobian, with a diagonal emission_cov"

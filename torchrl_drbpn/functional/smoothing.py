@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix, factorise, without_autocast
+from torchrl_drbpn.functional.informative import update_by_mask
 from torchrl_drbpn.functional.kalman import predict, update
 from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
 
@@ -113,9 +114,10 @@ def smooth_sequence(
         for t in range(steps[-1]):
             R = model.emission_cov if emission_cov is None else emission_cov[..., t, :, :]
             step = _predict(model, belief, previous_action[..., t, :], jacobian, reset[..., t])
-            belief = update(
-                step.predicted, observation[..., t, :], observed[..., t, :], H, R, offset[..., t, :]
-            )
+            given = (observation[..., t, :], observed[..., t, :], H, R, offset[..., t, :])
+            belief = update(step.predicted, *given)
+            if model.mask_model is not None:
+                belief, _ = update_by_mask(belief, *given, model.mask_model)
             filtered.append(belief)
             predictions.append(step)
         smoothed = filtered[-1:]

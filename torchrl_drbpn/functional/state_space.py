@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix
+from torchrl_drbpn.functional.informative import MaskModel
 
 __all__ = ["StateSpace", "TransitionMLP", "predict_step", "propagate"]
 
@@ -128,6 +129,7 @@ class StateSpace:
         transition_jacobian: F, the derivative of f by the mean, ``(state, state)`` of every step
             alike; or a callable of (mean, action) that returns ``(*batch, state, state)``. It
             propagates the covariance: P = F cov F' + Q. None: P = Q (eq. 8).
+        mask_model: why entries are missing, each field ``(obs,)``; None: it is ignored.
 
     Raises:
         ValueError: for a field of another shape, dtype or device.
@@ -151,6 +153,7 @@ class StateSpace:
     initial_mean: Tensor
     initial_cov: Tensor
     transition_jacobian: Tensor | Callable[[Tensor, Tensor], Tensor] | None = None
+    mask_model: MaskModel | None = None
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -170,6 +173,8 @@ class StateSpace:
         ]
         if isinstance(self.transition_cov, Tensor):
             fields.append(("transition_cov", self.transition_cov, (state, state)))
+        for name, value in (self.mask_model._asdict() if self.mask_model else {}).items():
+            fields.append((f"mask_model.{name}", value, (obs,)))
         if isinstance(self.transition_jacobian, Tensor):
             fields.append(("transition_jacobian", self.transition_jacobian, (state, state)))
         if isinstance(self.transition, TransitionMLP):

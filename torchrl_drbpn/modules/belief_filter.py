@@ -13,6 +13,7 @@ from torchrl_drbpn.functional import (
     Belief,
     FilterOutput,
     Forecast,
+    MaskModel,
     StateSpace,
     filter_sequence,
     filter_step,
@@ -83,6 +84,9 @@ class BeliefFilter(nn.Module):
             readings a weight under 1 (:func:`~torchrl_drbpn.functional.innovation_weights`), in
             acting and in training alike; None believes every reading. May be set later.
         robust_threshold: standard deviations off at which the weights begin to fall.
+        mask_model: whether to learn :class:`~torchrl_drbpn.functional.MaskModel` too: entries are
+            missing for a reason. The likelihood is then that of readings and mask, the belief
+            learns from what did not arrive, and the filter runs step by step.
         validate: look at values too, not only at shapes: a NaN or inf that the mask calls
             observed raises ValueError. Needs a value on the host, so it is skipped while
             compiling or exporting; switch it off under ``vmap``.
@@ -121,6 +125,7 @@ class BeliefFilter(nn.Module):
         jacobian: Literal["mean", "row"] = "mean",
         robust: Robust | None = None,
         robust_threshold: float = 4.0,
+        mask_model: bool = False,
         validate: bool = True,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
@@ -163,12 +168,17 @@ class BeliefFilter(nn.Module):
         self.initial_noise = LearnedCovariance(
             state_dim, initial_cov, initial_std, _MIN_INITIAL_STD, name="initial_cov", **place
         )
+        self.mask_model: nn.Parameter | None = None
+        if mask_model:  # intercepts, slopes
+            self.mask_model = nn.Parameter(torch.zeros(2, obs_dim, **place))
         self._check_model()
         self._fresh = covariance == "propagated"
 
     def reset_parameters(self) -> None:
         """Start again, the parts included where they know how."""
         nn.init.zeros_(self.initial_mean)
+        if self.mask_model is not None:
+            nn.init.zeros_(self.mask_model)
         for part in self.children():
             reset = getattr(part, "reset_parameters", None)
             if callable(reset):
@@ -200,8 +210,18 @@ class BeliefFilter(nn.Module):
             F = self.mean_jacobian
         elif self.covariance == "propagated":
             F = functools.partial(jacobian_of, self.transition)
+        mask_model = None if self.mask_model is None else MaskModel(*self.mask_model)
         return StateSpace(
-            mean, cov, matrix, R, action_matrix, offset, self.initial_mean, initial_cov, F
+            mean,
+            cov,
+            matrix,
+            R,
+            action_matrix,
+            offset,
+            self.initial_mean,
+            initial_cov,
+            F,
+            mask_model,
         )
 
     @torch.no_grad()
@@ -359,6 +379,7 @@ class BeliefFilter(nn.Module):
         """
         if self.validate:
             refuse_readings(observation, observed)
+        cov = cov if self.covariance == "propagated" else None
         return smooth_sequence(
             self.state_space(), mean, cov, previous_action, observation, observed, reset, **options
         )
@@ -367,6 +388,7 @@ class BeliefFilter(nn.Module):
         self, mean: Tensor, cov: Tensor | None, action: Tensor, **options: Any
     ) -> Forecast:
         """Predict the steps ahead; see :func:`~torchrl_drbpn.functional.forecast`."""
+        cov = cov if self.covariance == "propagated" else None
         return forecast(self.state_space(), mean, cov, action, **options)
 
     # ------------------------------------------------------------------ checks

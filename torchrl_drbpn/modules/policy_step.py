@@ -45,7 +45,7 @@ class PolicyStep(nn.Module):
 
     Raises:
         TypeError: if ``belief`` is no :class:`~torchrl_drbpn.BeliefFilterModule`.
-        ValueError: if only one of the two limits is given.
+        ValueError: if only one of the two limits is given, or the filter has a ``mask_model``.
 
     Example:
         >>> import torch
@@ -77,6 +77,8 @@ class PolicyStep(nn.Module):
                 f"`belief` must be a BeliefFilterModule, got {type(belief).__name__}: other belief "
                 "modules have recurrent states of their own."
             )
+        if belief.filter.mask_model is not None:
+            raise ValueError("`belief` has a `mask_model`, which PolicyStep does not read.")
         if (action_low is None) != (action_high is None):
             raise ValueError("`action_low` and `action_high` must be given together or not at all.")
         self.policy_input = belief.policy_input

@@ -1,0 +1,192 @@
+"""Entries missing for a reason: the model of the mask, and the belief that learns from it.
+
+Specified here: for one missing entry the update has the exact moments (numerical integration); a
+mask that says nothing changes nothing; on a linear system whose high readings are missing the
+filter that ignores it is biased, and the one that learned why removes more than half of the bias.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from filter_problems import assert_equal
+from tensordict import TensorDict
+from torchrl.modules import set_recurrent_mode
+
+from torchrl_drbpn import BeliefFilter, BeliefFilterModule, BeliefModelLoss, PolicyStep
+from torchrl_drbpn.functional import (
+    Belief,
+    MaskModel,
+    StateSpace,
+    filter_sequence,
+    smooth_sequence,
+    update_by_mask,
+)
+
+DOUBLE = {"dtype": torch.float64}
+
+
+def phi(z: torch.Tensor) -> torch.Tensor:
+    return torch.special.ndtr(math.sqrt(math.pi / 8) * z)
+
+
+@pytest.mark.parametrize("slope", [-3.0, 0.4, 20.0])
+@pytest.mark.parametrize("mean", [-2.0, 0.3, 4.0])
+def test_one_missing_entry_has_the_moments_and_probability_of_numerical_integration(slope, mean):
+    """Over the state in one dimension; the reading's noise is integrated on a second grid."""
+    a, P, R, h, o = 0.5, 1.7, 0.4, 1.3, -0.2
+    s = torch.linspace(-10, 10, 4001, **DOUBLE) * math.sqrt(P) + mean
+    e = torch.linspace(-8, 8, 801, **DOUBLE) * math.sqrt(R)
+    prior = torch.exp(-0.5 * (s - mean) ** 2 / P)
+    noise = torch.exp(-0.5 * e**2 / R)
+    absent = phi(-(a + slope * (h * s[:, None] + o + e))) @ (noise / noise.sum())
+    weight = prior / prior.sum() * absent
+    Z = weight.sum()
+    exact = (weight * s).sum() / Z
+    spread = (weight * (s - exact) ** 2).sum() / Z
+
+    def vector(x: float) -> torch.Tensor:
+        return torch.tensor([x], **DOUBLE)
+
+    after, log_mask = update_by_mask(
+        Belief(vector(mean), vector(P)[None]), vector(math.nan), torch.tensor([False]),
+        vector(h)[None], vector(R), vector(o), MaskModel(vector(a), vector(slope)),
+    )  # fmt: skip
+    assert_equal(after.mean[0], exact, 1e-6)
+    assert_equal(after.cov[0, 0], spread, 1e-6)
+    assert_equal(log_mask, Z.log(), 1e-6)
+
+
+def system(mask_model: MaskModel | None = None, *, propagated: bool = True) -> StateSpace:
+    """Let s' = .95 s + N(0, .3^2), seen by sensors with a noise of .2."""
+    eye = torch.eye(1, **DOUBLE)
+    ones = torch.ones(2, 1, **DOUBLE)
+    return StateSpace(
+        lambda m, _: 0.95 * m, 0.09 * eye, ones, 0.04 * ones[:, 0], 0 * ones, 0 * ones[:, 0],
+        0 * eye[0], eye, 0.95 * eye if propagated else None, mask_model,
+    )  # fmt: skip
+
+
+def high_readings_are_missing(rows: int = 150, time: int = 40) -> tuple:
+    """Return the states and what the filter is given: P(arrives) = 1 / (1 + exp(3 x))."""
+    g = torch.Generator().manual_seed(0)
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=g, **DOUBLE)
+
+    states = [noise(rows)]
+    for _ in range(time - 1):
+        states.append(0.95 * states[-1] + 0.3 * noise(rows))
+    state = torch.stack(states, 1)
+    x = state.unsqueeze(-1) + 0.2 * noise(rows, time, 2)
+    observed = torch.rand(x.shape, generator=g, **DOUBLE) < torch.sigmoid(-3 * x)
+    reset = torch.zeros(rows, time, dtype=torch.bool)
+    reset[:, 0] = True
+    zero = torch.zeros(rows, 1, **DOUBLE)
+    x = x.where(observed, math.nan)
+    return state, (zero, torch.zeros(rows, time, 1, **DOUBLE), x, observed, reset)
+
+
+def test_learning_why_readings_are_missing_removes_most_of_the_bias():
+    state, given = high_readings_are_missing()
+    cov = torch.zeros(len(state), 1, 1, **DOUBLE)
+    parameters = torch.zeros(2, 2, **DOUBLE, requires_grad=True)
+    optimizer = torch.optim.LBFGS([parameters], max_iter=8, line_search_fn="strong_wolfe")
+
+    def loss() -> torch.Tensor:
+        optimizer.zero_grad()
+        out = filter_sequence(system(MaskModel(*parameters)), *given, cov=cov)
+        value = -out.log_likelihood.mean()
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    learned = MaskModel(*parameters.detach())
+    assert bool((learned.slope < -1.5).all())
+    gone = ~given[3].any(-1)
+    bias, squared = {}, {}
+    for name, mask_model in (("ignored", None), ("learned", learned)):
+        out = filter_sequence(system(mask_model), *given, cov=cov, return_cov=True)
+        error = out.mean[..., 0] - state
+        bias[name], squared[name] = error[gone].mean().abs(), error.square().mean()
+        nees = (error.square() / out.cov[..., 0, 0]).mean()
+        if name == "learned":
+            assert nees == pytest.approx(1.0, abs=0.15)
+    assert bias["ignored"] > 0.3
+    assert bias["learned"] < 0.5 * bias["ignored"]
+    assert squared["learned"] < 0.7 * squared["ignored"]
+    smoothed = smooth_sequence(system(learned), given[0], None, *given[1:])
+    assert (smoothed.mean[..., 0] - state)[gone].mean().abs() < 0.5 * bias["ignored"]
+
+
+def test_a_mask_without_a_reason_changes_no_belief_and_adds_its_own_probability():
+    _, given = high_readings_are_missing(4, 10)
+    cov = torch.zeros(4, 1, 1, **DOUBLE)
+    a = torch.tensor([0.7, -1.0], **DOUBLE)
+    plain = filter_sequence(system(), *given, cov=cov)
+    told = filter_sequence(system(MaskModel(a, 0 * a)), *given, cov=cov)
+    assert_equal(told.mean, plain.mean)
+    assert_equal(told.cov, plain.cov)
+    expected = torch.where(given[3], phi(a).log(), phi(-a).log()).sum(-1)
+    assert_equal(told.log_likelihood - plain.log_likelihood, expected)
+    with pytest.raises(ValueError, match="'native' cannot run here"):
+        filter_sequence(system(MaskModel(a, a)), *given, cov=cov, form="native")
+    with pytest.raises(ValueError, match=r"`mask_model.slope` must have shape \(2,\)"):
+        system(MaskModel(a, a[:1]))
+
+
+def test_gradients_agree_with_finite_differences_at_a_slope_of_zero_too():
+    """With the constant covariance: a propagated one is a constant of autograd by design."""
+    _, given = high_readings_are_missing(2, 4)
+
+    def likelihood(parameters: torch.Tensor) -> torch.Tensor:
+        model = system(MaskModel(*parameters), propagated=False)
+        return filter_sequence(model, *given).log_likelihood
+
+    for slope in (-2.0, 1e-3):
+        start = torch.tensor([[0.3, 0.1], [slope, 2 * slope]], **DOUBLE, requires_grad=True)
+        assert torch.autograd.gradcheck(likelihood, start)
+    start = torch.zeros(2, 2, **DOUBLE, requires_grad=True)
+    (gradient,) = torch.autograd.grad(likelihood(start).sum(), start)
+    assert bool(gradient.isfinite().all())
+    assert bool((gradient != 0).any())
+
+
+@pytest.mark.parametrize("covariance", ["constant", "propagated"])
+def test_the_module_learns_it_by_the_model_loss_and_steps_are_the_sequence(covariance):
+    torch.manual_seed(0)
+    belief_filter = BeliefFilter(3, 2, mask_model=True, covariance=covariance, dtype=torch.float64)
+    with torch.no_grad():
+        belief_filter.mask_model.copy_(torch.randn(2, 3))
+    x, observed = torch.randn(4, 5, 3, **DOUBLE), torch.rand(4, 5, 3) < 0.5
+    reset = torch.zeros(4, 5, dtype=torch.bool)
+    reset[:, 0] = True
+    action = torch.zeros(4, 5, 2, **DOUBLE)
+    mean, cov = torch.zeros(4, 3, **DOUBLE), torch.zeros(4, 3, 3, **DOUBLE)
+    whole = belief_filter(mean, cov, action, x, observed, reset, return_cov=True)
+    for t in range(5):
+        steps = (action[:, t], x[:, t], observed[:, t], reset[:, t])
+        mean, cov, ll = belief_filter.step(mean, cov, *steps, return_cov=True)
+        assert_equal(mean, whole.mean[:, t])
+        assert_equal(ll, whole.log_likelihood[:, t])
+    module = BeliefFilterModule(belief_filter)
+    data = TensorDict(
+        observation=x, observed=observed, previous_action=action, is_init=reset.unsqueeze(-1),
+        batch_size=[4, 5],
+    )  # fmt: skip
+    with set_recurrent_mode(True), pytest.warns(UserWarning, match="initial belief"):
+        module(data)
+    assert_equal(data["belief", "log_likelihood"], whole.log_likelihood)
+    BeliefModelLoss()(data)["loss_model"].backward()
+    assert bool((belief_filter.mask_model.grad != 0).all())
+    with pytest.raises(ValueError, match="`mask_model`, which PolicyStep does not read"):
+        PolicyStep(module, torch.nn.Linear(3, 2))
+    with pytest.raises(ValueError, match="its belief learns from the mask"):
+        filter_sequence(
+            belief_filter.state_space(), torch.zeros(4, 3, **DOUBLE), action, x, observed, reset,
+            cov=torch.zeros(4, 3, 3, **DOUBLE), form="native",
+        )  # fmt: skip
+    belief_filter.reset_parameters()
+    assert not belief_filter.mask_model.any()
