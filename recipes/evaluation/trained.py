@@ -141,9 +141,7 @@ def load_trained_agent(
     except ValueError as error:
         raise UserError(str(error)) from error
     agent.belief.filter.robust, agent.belief.filter.robust_threshold = update, threshold
-    return replace(
-        trained, robust=f"{robust} {threshold:g}" if update else "every reading believed"
-    )
+    return replace(trained, robust=f"{robust} {threshold:g}" if update else "not robust")
 
 
 def save_weights(folder: Path, trained: TrainedAgent) -> None:
