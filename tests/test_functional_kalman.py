@@ -53,6 +53,19 @@ def test_masking_an_entry_equals_deleting_its_row_in_values_and_gradients(state,
         assert_equal(a, e)
 
 
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+@sized
+def test_readings_one_after_the_other_lead_where_all_at_once_do(state, obs, dtype, tolerance):
+    (belief, x, observed, h, r, offset), _ = given(state, obs, full_noise=False)
+    expected = F.update(belief, x, observed, h, r, offset)
+    parts = [t.to(dtype) for t in (*belief, torch.where(observed, x, torch.nan), h, r, offset)]
+    mean, cov, x, h, r, offset = parts
+    actual = F.sequential_update(Belief(mean, cov), x, observed, h, r.diagonal(), offset)
+    assert actual.mean.dtype == actual.cov.dtype == dtype
+    for a, e in zip(actual, expected, strict=True):
+        assert_equal(a.double(), e, tolerance)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @sized
 def test_nothing_observed_returns_the_predicted_belief_and_likelihood_zero(state, obs, dtype):

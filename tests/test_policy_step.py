@@ -127,6 +127,32 @@ def test_a_step_equals_the_tensordict_policy(kind, policy_input):
     assert torch.equal(our_age, age)
 
 
+@pytest.mark.parametrize("policy_input", ["mean", "mean_cov"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("kind", ["innovation", "information", "network", "propagated", "row"])
+def test_readings_taken_one_by_one_lead_to_the_same_decisions(kind, dtype, policy_input):
+    belief, head = make(kind, policy_input, dtype)
+    step, sequential = (PolicyStep(belief, head, sequential=by_one) for by_one in (False, True))
+    args = [x.to(dtype) if x.is_floating_point() else x for x in first_step(belief)]
+    for _ in range(4):
+        found, expected = sequential(*args), step(*args)
+        for a, b in zip(found, expected, strict=True):
+            tolerance = 1e-10 if dtype is torch.float64 else 1e-5
+            torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
+        _, mean, age, action, _, *cov = expected
+        args[2:] = [action, torch.zeros_like(args[3]), mean, age, *cov]
+
+
+def test_a_full_noise_covariance_and_a_robust_update_have_no_sequential_form():
+    belief, head = make("full")
+    with pytest.raises(ValueError, match="`sequential` needs a diagonal emission covariance"):
+        PolicyStep(belief, head, sequential=True)
+    belief, head = make("innovation")
+    belief.filter.robust = "huber"
+    with pytest.raises(ValueError, match=r"`sequential` needs .* `robust` None"):
+        PolicyStep(belief, head, sequential=True)
+
+
 @pytest.mark.parametrize(
     ("obs", "state", "cov"),
     [(27, 8, "full"), (105, 16, "full"), (105, 16, "diag"), (17, 17, "diag")],

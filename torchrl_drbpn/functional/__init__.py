@@ -24,7 +24,13 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 from torchrl_drbpn.functional.informative import MaskModel, update_by_mask
-from torchrl_drbpn.functional.kalman import innovation, log_likelihood, predict, update
+from torchrl_drbpn.functional.kalman import (
+    innovation,
+    log_likelihood,
+    predict,
+    sequential_update,
+    update,
+)
 from torchrl_drbpn.functional.missingness import (
     MissingnessMechanism,
     OutageRates,
@@ -124,6 +130,7 @@ __all__ = [
     "sample_spikes",
     "sample_working",
     "select_sensors",
+    "sequential_update",
     "smooth_sequence",
     "systematic_ancestors",
     "tril_to_vector",

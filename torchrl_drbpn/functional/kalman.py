@@ -25,7 +25,7 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 
-__all__ = ["innovation", "log_likelihood", "predict", "update"]
+__all__ = ["innovation", "log_likelihood", "predict", "sequential_update", "update"]
 
 
 def predict(
@@ -192,6 +192,52 @@ def update(
     cov = rounded_cov(cov, dtype)
     anything = observed.any(-1)[..., None, None]
     return Belief(mean, torch.where(anything, cov, P.to(dtype)))
+
+
+def sequential_update(
+    belief: Belief,
+    observation: Tensor,
+    observed: Tensor,
+    emission_matrix: Tensor,
+    emission_cov: Tensor,
+    offset: Tensor | None = None,
+) -> Belief:
+    r"""Condition a belief on the entries that arrived, one after the other.
+
+    .. math::
+        s_i = h_i' P h_i + r_i, \quad k_i = P h_i / s_i, \quad
+        m \leftarrow m + k_i (x_i - h_i' m), \quad P \leftarrow P - k_i h_i' P
+
+    The result is that of :func:`update` where R is diagonal [Anderson and Moore 1979]. Nothing is
+    factorised: what has no Cholesky decomposition, such as ONNX, can run it.
+
+    Args:
+        belief: predicted belief, mean ``(*batch, state)``, cov ``(*batch, state, state)``.
+        observation: shape ``(*batch, obs)``; missing entries may hold anything.
+        observed: bool, shape ``(*batch, obs)``.
+        emission_matrix: H, shape ``(obs, state)``.
+        emission_cov: r, the variances ``(obs,)`` of independent noise.
+        offset: B a + d, shape ``(*batch, obs)``; None is 0.
+
+    Returns:
+        The filtered belief.
+
+    Example:
+        >>> import torch
+        >>> belief, H = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
+        >>> step = belief, torch.ones(2), torch.ones(2, dtype=torch.bool), H, torch.ones(2)
+        >>> all(torch.allclose(a, b) for a, b in zip(sequential_update(*step), update(*step)))
+        True
+    """
+    dtype, (m, P) = belief.mean.dtype, (belief.mean.double(), belief.cov.double())
+    x = zero_missing(observation if offset is None else observation - offset, observed).double()
+    for i, (h, r) in enumerate(zip(emission_matrix.double(), emission_cov.double(), strict=True)):
+        along = P @ h
+        gain = along / ((along * h).sum(-1, keepdim=True) + r)
+        gain = zero_missing(gain, observed[..., i : i + 1])
+        m = m + gain * (x[..., i : i + 1] - (m * h).sum(-1, keepdim=True))
+        P = P - gain.unsqueeze(-1) * along.unsqueeze(-2)
+    return Belief(m.to(dtype), rounded_cov(P, dtype))
 
 
 def log_likelihood(

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_drbpn.functional import (
+    Belief,
     innovation_weights,
     propagate,
+    sequential_update,
     tril_to_vector,
     zero_missing,
 )
@@ -42,10 +44,12 @@ class PolicyStep(nn.Module):
         norm: standardises the observations first, where the belief reads standardised ones.
         action_low: smallest action, shape ``(action,)``, action units; None: no limit.
         action_high: largest action.
+        sequential: take the readings one by one, which needs no Cholesky factor: for ONNX.
 
     Raises:
         TypeError: if ``belief`` is no :class:`~torchrl_drbpn.BeliefFilterModule`.
-        ValueError: if only one of the two limits is given, or the filter has a ``mask_model``.
+        ValueError: if only one of the two limits is given, if the filter has a ``mask_model``, or
+            for ``sequential`` with a full R or a robust update.
 
     Example:
         >>> import torch
@@ -70,6 +74,7 @@ class PolicyStep(nn.Module):
         norm: MaskedObservationNorm | None = None,
         action_low: Tensor | None = None,
         action_high: Tensor | None = None,
+        sequential: bool = False,
     ) -> None:
         super().__init__()
         if not isinstance(belief, BeliefFilterModule):
@@ -94,7 +99,13 @@ class PolicyStep(nn.Module):
         H, R = model.emission_matrix.double().clone(), model.full_emission_cov().double()
         P0, self.constant = model.full_initial_cov(), isinstance(model.transition_cov, Tensor)
         self.propagated = model.transition_jacobian is not None
-        self.information = self.constant and model.information_form and not self.propagated
+        if sequential and (model.emission_cov.ndim == 2 or self.filter.robust is not None):
+            raise ValueError(
+                "`sequential` needs a diagonal emission covariance and `robust` None: readings "
+                "taken one by one must be independent, and a robust update compares them."
+            )
+        self.sequential, form = sequential, model.information_form and not sequential
+        self.information = self.constant and form and not self.propagated
         P = torch.stack([model.constant_cov() if self.constant else P0, P0]).double()
         self.matrix, self.noise, self.prior = nn.Buffer(H), nn.Buffer(R), nn.Buffer(P)
         self.cross, self.innovation_cov = nn.Buffer(H @ P), nn.Buffer(H @ P @ H.mT + R)
@@ -206,7 +217,14 @@ class PolicyStep(nn.Module):
             S = S + torch.diag_embed(zero_missing(noise / trust - noise, seen))
         residual = residual.unsqueeze(-1)
         # cholesky_ex: its plain form looks at a value on the host to raise.
-        if self.information:
+        if self.sequential:
+            # Of the difference from the predicted mean, which is 0 before the first reading.
+            P = _row(self.prior, first) if P is None else P
+            change = Belief(torch.zeros_like(m, dtype=H.dtype), P)
+            arrived, r = residual.squeeze(-1), self.noise.diagonal()
+            step, filtered_cov = sequential_update(change, arrived, seen, H, r)
+            step = step.unsqueeze(-1)
+        elif self.information:
             weight = trust * self.weight
             precision = (weight @ self.outer).view(*weight.shape[:-1], *self.prior.shape[1:])
             factor, _ = torch.linalg.cholesky_ex(precision + _row(self.precision, first))
