@@ -90,10 +90,20 @@ def test_each_finished_episode_is_a_row_with_its_raw_return(smoke: Path) -> None
         assert float(row["return"]) == float(row["length"]) - 1
 
 
-def test_the_tensorboard_logger_writes_its_file(tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
-    run(tmp_path / "run", *SMOKE, "logger=tensorboard", "total_frames=128")
-    assert list((tmp_path / "run" / "logs").glob("events.out*"))
+@pytest.mark.parametrize(
+    ("name", "file", "words"),
+    [
+        ("tensorboard", "logs/events.out*", []),
+        ("wandb", "wandb/offline-run*/*.wandb", ["logger.wandb_kwargs.offline=true"]),
+        ("mlflow", "mlflow.db", []),
+    ],
+)
+def test_a_logger_by_name_writes_its_file(
+    tmp_path: Path, name: str, file: str, words: list[str]
+) -> None:
+    pytest.importorskip(name)
+    run(tmp_path / "run", *SMOKE, f"logger={name}", "total_frames=128", *words)
+    assert list((tmp_path / "run").glob(file))
 
 
 def test_the_statistics_are_constant_while_a_rollout_is_collected_and_learned_from() -> None:
@@ -381,14 +391,13 @@ def test_what_a_killed_writer_left_is_removed_and_foreign_files_are_left_alone(
     assert foreign.read_text() == "half"
 
 
-def test_tensorboard_that_is_not_installed_is_one_line_and_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
+def test_a_logger_that_is_not_installed_is_one_line_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    for name in ("tensorboard", "torch.utils.tensorboard"):
-        monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(UserError, match=r"`logger`: .*tensorboard") as error:
-        run(tmp_path / "run", *SMOKE, "logger=tensorboard")
-    assert "\n" not in str(error.value)
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UserError, match=rf"`logger={name}` .*: pip install {name}\.$"):
+        run(tmp_path / "run", *SMOKE, f"logger={name}")
     assert not list((tmp_path / "run").iterdir())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import fcntl
+import importlib.util
 import io
 import json
 import os
@@ -17,6 +18,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from torchrl.record.loggers import Logger, MLFlowLogger, get_logger
 from yaml import YAMLError
 
 from training.config import build
@@ -213,6 +215,22 @@ def locked(folder: Path) -> Iterator[None]:
         finally:
             if [path.name for path in folder.iterdir()] == [".lock"]:  # refused: leave nothing
                 (folder / ".lock").unlink()
+
+
+def make_logger(
+    *, logger_type: str, logger_name: str, experiment_name: str, **kwargs: Any
+) -> Logger:
+    """Make a logger of TorchRL's, see conf/logger; name the package that is not installed."""
+    if logger_type != "csv" and importlib.util.find_spec(logger_type) is None:
+        raise UserError(
+            f"`logger={logger_type}` needs {logger_type}, which is not installed: "
+            f"pip install {logger_type}."
+        )
+    if logger_type != "mlflow":
+        return get_logger(logger_type, logger_name, experiment_name, **kwargs)
+    # get_logger would give a folder of files, which MLflow gave up.
+    uri = kwargs["tracking_uri"] or f"sqlite:///{Path(logger_name, 'mlflow.db').absolute()}"
+    return MLFlowLogger(exp_name=experiment_name, tracking_uri=uri)
 
 
 # Numbers --------------------------------------------------------------------------------------
