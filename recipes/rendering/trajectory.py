@@ -127,7 +127,8 @@ def record_episode(
     """
     # States are read from Gymnasium's simulators, whatever the agent was trained on.
     local = trained.settings.copy()
-    local.env.backend = "gymnasium"
+    if "backend" in local.env:
+        local.env.backend = "gymnasium"
     task, env = env_name(local), None
     make = replace(trained, settings=local).environments(
         condition.missingness, condition.noise, removed, complete=True

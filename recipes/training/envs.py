@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
+from torchrl.envs import (
+    CatTensors,
+    Compose,
+    DoubleToFloat,
+    EnvBase,
+    ParallelEnv,
+    RenameTransform,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
 
 from torchrl_drbpn import (
     ObservationDelay,
@@ -74,6 +84,8 @@ def make_simulators(
     num_envs: int,
     num_threads: int,
     backend: str,
+    observation_keys: Sequence[str] | None,
+    wrappers: Sequence[Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]],
     kwargs: Mapping[str, Any],
 ) -> EnvBase:
     """Build many simulators of a Gymnasium task, see conf/env/gym.yaml."""
@@ -81,10 +93,51 @@ def make_simulators(
     if backend not in backends:
         raise UserError(f"`env.backend` must be gymnasium or envpool, got {backend!r}.")
     name = f"{id}-{version}" if version else id
+    more = {**kwargs, "wrappers": wrappers} if wrappers else kwargs
     try:
-        return backends[backend](name, num_envs, num_threads=num_threads, **kwargs)
+        return backends[backend](
+            name, num_envs, num_threads=num_threads, observation_keys=observation_keys, **more
+        )
     except (ValueError, TypeError, ModuleNotFoundError, gymnasium.error.Error) as error:
         raise UserError(f"`env.id={name}`: {one_line(error)}") from error
+
+
+def make_torchrl_env(
+    *,
+    id: str,
+    version: str | None,
+    make: Callable[[], EnvBase],
+    num_envs: int,
+    parallel: bool,
+    observation_keys: Sequence[str],
+) -> TransformedEnv:
+    """Build any environment of TorchRL, see conf/env/torchrl.yaml.
+
+    One that is a batch by itself, on a device perhaps, is taken as it is.
+    """
+    del id, version  # its name in folders and tables
+    try:
+        base = make()
+        if not base.batch_size:
+            base.close()
+            base = (ParallelEnv if parallel else SerialEnv)(num_envs, make)
+    except (ValueError, ImportError, RuntimeError) as error:
+        raise UserError(f"`env.make`: {one_line(error)}") from error
+    if base.batch_size != (num_envs,):
+        raise UserError(
+            f"`env.make` gives a batch of {tuple(base.batch_size)} environments: set "
+            f"collector.num_envs={base.batch_size.numel()}, got {num_envs}."
+        )
+    known = [key for key in base.observation_spec.keys(True, True) if isinstance(key, str)]
+    if unknown := [key for key in observation_keys if key not in known]:
+        raise UserError(
+            f"`env.observation_keys` must hold entries of the observation, {', '.join(known)}; "
+            f"got {', '.join(unknown)}."
+        )
+    parts: list[Transform] = [DoubleToFloat()]
+    if [*observation_keys] != ["observation"]:
+        parts.append(CatTensors([*observation_keys], "observation"))
+    return TransformedEnv(base, Compose(*parts))
 
 
 def env_name(config: DictConfig) -> str:

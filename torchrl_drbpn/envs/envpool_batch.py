@@ -76,7 +76,10 @@ class EnvPoolBatchEnv(SimulatorBatch):
         if isinstance(action, gymnasium.spaces.Box):  # of float64 in EnvPool
             low, high = action.low.astype(np.float32), action.high.astype(np.float32)
             action = gymnasium.spaces.Box(low, high)
-        return spec.gymnasium_observation_space, action, int(spec.config.max_episode_steps), None
+        seen = self._chosen(spec.gymnasium_observation_space)
+        if self.joined_keys is not None:
+            seen = gymnasium.spaces.flatten_space(seen)
+        return seen, action, int(spec.config.max_episode_steps), None
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
@@ -91,7 +94,7 @@ class EnvPoolBatchEnv(SimulatorBatch):
         if self._pool is None or (self._seeds[rows] != NO_SEED).any():
             self._make_pool()
         if len(rows):
-            observation[rows], _ = self._pool.reset(rows.astype(np.int32))
+            observation[rows] = self._vectors(self._pool.reset(rows.astype(np.int32))[0])
             self._over[rows] = False
 
     def _make_pool(self) -> None:
@@ -111,6 +114,11 @@ class EnvPoolBatchEnv(SimulatorBatch):
         )
         self._over[:] = self._started[:] = False
 
+    def _vectors(self, seen: Any) -> Any:
+        if self.joined_keys is None:
+            return seen
+        return np.concatenate([seen[k].reshape(len(seen[k]), -1) for k in self.joined_keys], 1)
+
     def _advance(self, rows: NDArray[np.int64] | None, arrays: StepArrays) -> None:
         chosen = np.arange(self.num_envs) if rows is None else rows
         if self._over[chosen].any():
@@ -123,7 +131,7 @@ class EnvPoolBatchEnv(SimulatorBatch):
             numbered = () if rows is None else (rows,)
             seen, gained, ended, _, _ = self._pool.step(arrays.action[chosen], *numbered)
             # EnvPool's own limit, which would truncate, is out of reach
-            arrays.observation[chosen], arrays.reward[chosen, 0] = seen, gained
+            arrays.observation[chosen], arrays.reward[chosen, 0] = self._vectors(seen), gained
             arrays.terminated[chosen, 0] = ended
             self._over[chosen] = ended
 

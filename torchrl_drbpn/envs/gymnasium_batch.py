@@ -11,7 +11,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.wrappers import OrderEnforcing
+from gymnasium.spaces import flatten, flatten_space
+from gymnasium.wrappers import OrderEnforcing, TransformObservation
 from numpy.typing import NDArray
 
 from torchrl_drbpn.envs.engine_warnings import bad_state_counters, model_warnings_once
@@ -59,6 +60,8 @@ class GymnasiumBatchEnv(SimulatorBatch):
         num_threads: threads that step the environments, each its own share; the results do not
             depend on it. MuJoCo runs outside the interpreter lock, so that a second thread pays
             where a second core is free.
+        observation_keys: entries of a dictionary observation that are joined into one vector.
+        wrappers: callables that take an environment and return it wrapped, the innermost first.
         **make_kwargs: passed to ``gymnasium.make``, for example ``render_mode="rgb_array"``.
 
     Raises:
@@ -102,13 +105,22 @@ class GymnasiumBatchEnv(SimulatorBatch):
         return env.observation_space, env.action_space, limit, own
 
     def _make(self, name: str) -> gymnasium.Env[Any, Any]:
+        wanted = dict(self.make_kwargs)
+        wrappers = wanted.pop("wrappers", ())
         with warnings.catch_warnings():  # a version that was asked for by name is no mistake
             warnings.filterwarnings("ignore", ".*is out of date", DeprecationWarning)
-            env = gymnasium.make(
-                name, max_episode_steps=-1, disable_env_checker=True, **self.make_kwargs
-            )
+            env = gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **wanted)
         # The batch itself refuses a step before the first reset.
-        return env.env if isinstance(env, OrderEnforcing) else env
+        env = env.env if isinstance(env, OrderEnforcing) else env
+        for wrapper in wrappers:
+            env = wrapper(env)
+        if self.joined_keys is None:
+            return env
+        chosen = self._chosen(env.observation_space)
+        return TransformObservation(
+            env, lambda seen: flatten(chosen, {key: seen[key] for key in chosen}),
+            flatten_space(chosen),
+        )  # fmt: skip
 
     def _advance(self, rows: NDArray[np.int64] | None, arrays: StepArrays) -> None:
         if rows is not None:

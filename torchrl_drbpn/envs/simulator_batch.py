@@ -7,6 +7,7 @@ batch pays it once for all of them: what the simulators return crosses into torc
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
@@ -54,6 +55,7 @@ class SimulatorBatch(EnvBase):
         dtype: torch.dtype = torch.float32,
         max_episode_steps: int | None = None,
         num_threads: int = 1,
+        observation_keys: Sequence[str] | None = None,
         **make_kwargs: Any,
     ) -> None:
         counts = {"num_envs": num_envs, "num_threads": num_threads}
@@ -67,6 +69,7 @@ class SimulatorBatch(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.env_id, self.num_envs, self.dtype = env_id, num_envs, dtype
         self.num_threads, self.make_kwargs = min(num_threads, num_envs), make_kwargs
+        self.joined_keys = None if observation_keys is None else tuple(observation_keys)
         observation_space, action_space, registered, own = self._build()
         limit = registered if max_episode_steps is None else max_episode_steps
         limits = [steps for steps in (limit, own) if steps not in (None, -1)]
@@ -99,14 +102,29 @@ class SimulatorBatch(EnvBase):
     def _close_simulators(self) -> None:
         """Free the simulators and their threads."""
 
+    def _chosen(self, space: Any) -> Any:
+        """Return what is read of an observation: all of it, or a dictionary of what is asked for.
+
+        A dictionary is flattened in the order of ``observation_keys``.
+        """
+        keys, known = self.joined_keys, getattr(space, "spaces", {})
+        if keys is None:
+            return space
+        if not keys or not known.keys() >= {*keys}:
+            raise ValueError(
+                f"`observation_keys` must hold entries of the observation of `{self.env_id}`, got "
+                f"{[*keys]}: it has {', '.join(known) or 'none, it is no dictionary'}."
+            )
+        return gymnasium.spaces.Dict([(key, known[key]) for key in keys])
+
     def _make_specs(self, observation: Any, action: Any) -> None:
         for name, space in (("observation", observation), ("action", action)):
             vector = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1
             if not vector or not np.issubdtype(space.dtype, np.floating):
                 raise ValueError(
                     f"the {name} space of `{self.env_id}` must be a vector of real numbers (a Box "
-                    f"with one dimension), got {one_line(space)}: discrete spaces, images and "
-                    "dictionaries are not supported."
+                    f"with one dimension), got {one_line(space)}: `observation_keys` joins "
+                    "entries of a dictionary."
                 )
         if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
             raise ValueError(
