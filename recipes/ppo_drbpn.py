@@ -161,7 +161,7 @@ def train(config: DictConfig, folder: Path) -> int:
             if frames >= config.total_frames and is_evaluated(folder, config):
                 say(f"`{folder}` is at its end; more total_frames go on with it")
                 return 0
-            if not training.env.base_env.supports_state:
+            if not getattr(training.env.base_env, "supports_state", False):
                 say(f"{env_name(config)} can't save its state here: going on with new episodes")
         log = RunLog(folder, config, list(training.agent.summary()), frames, evaluated)
         write_config(folder, config)

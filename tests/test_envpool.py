@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from env_tools import TASKS, play, random_actions
+from torchrl.envs import check_env_specs
 
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
@@ -162,7 +163,7 @@ def test_a_truncated_row_may_be_stepped_on():
     ("use", "error", "match"),
     [
         (lambda: EnvPoolBatchEnv("CartPole-v1", 1), ValueError, "action space .* got Discrete"),
-        (lambda: EnvPoolBatchEnv("CheetahRun-v1", 1), ValueError, "observation space .* got Dict"),
+        (lambda: EnvPoolBatchEnv("CheetahRun-v1", 1), ValueError, "got Dict.*`observation_keys`"),
         (lambda: EnvPoolBatchEnv("Swimmer-v5", 1, render_mode="rgb_array"), TypeError,
          r"takes no \['render_mode'\]"),
         (lambda: EnvPoolBatchEnv("Swimmer-v5", 1).reset(options={"x": 1}), ValueError, "no `opti"),
@@ -171,6 +172,15 @@ def test_a_truncated_row_may_be_stepped_on():
 def test_what_envpool_does_not_have_is_refused(use, error, match):
     with pytest.raises(error, match=match):
         use()
+
+
+def test_a_task_of_dm_control_is_a_vector_of_the_entries_asked_for():
+    env = EnvPoolBatchEnv("CheetahRun-v1", 2, observation_keys=["position", "velocity"])
+    check_env_specs(env)
+    joined = env.reset(seed=0)["observation"]
+    speeds = EnvPoolBatchEnv("CheetahRun-v1", 2, observation_keys=["velocity"]).reset(seed=0)
+    assert joined.shape == (2, 17)
+    assert torch.equal(joined[:, 8:], speeds["observation"])
 
 
 def test_stepping_on_after_a_termination_is_refused_rather_than_a_new_episode():

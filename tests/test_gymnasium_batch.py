@@ -299,6 +299,33 @@ def test_a_task_without_mujoco_says_that_it_can_not_be_saved():
         env.close(raise_if_closed=False)
 
 
+def test_entries_of_a_dictionary_are_joined_in_the_order_asked_for(register):
+    class Halves(Counter):
+        def step(self, action):
+            seen, *rest = super().step(action)
+            return {"b": 2 * seen[:2], "c": seen, "a": seen[:1]}, *rest
+
+        def reset(self, **kwargs):
+            seen, info = super().reset(**kwargs)
+            return {"b": 2 * seen[:2], "c": seen, "a": seen[:1]}, info
+
+    two = spaces.Dict(a=spaces.Box(-1, 1, (1,)), b=spaces.Box(-1, 1, (2,)), c=VECTOR)
+    env_id = register(Halves, kwargs={"observation": two})
+    env = GymnasiumBatchEnv(env_id, 2, observation_keys=["b", "a"])
+    rollout = env.rollout(2, break_when_any_done=False)
+    assert rollout["next", "observation"][0].tolist() == [[2, 2, 1], [4, 4, 2]]
+    for keys in (["b", "x"], []):
+        with pytest.raises(ValueError, match=r"`observation_keys` .* it has a, b, c\.$"):
+            GymnasiumBatchEnv(env_id, 2, observation_keys=keys)
+
+
+def test_wrappers_of_gymnasium_go_around_each_environment(register):
+    wrappers = [partial(gymnasium.wrappers.RescaleObservation, min_obs=0, max_obs=1)] * 2
+    env = GymnasiumBatchEnv(register(Counter), 2, wrappers=wrappers)
+    env = copy.deepcopy(env)
+    assert env.reset()["observation"].tolist() == [[0.5] * 3] * 2
+
+
 @pytest.mark.parametrize(
     ("observation", "action", "match"),
     [

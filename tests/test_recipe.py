@@ -90,6 +90,17 @@ def test_each_finished_episode_is_a_row_with_its_raw_return(smoke: Path) -> None
         assert float(row["return"]) == float(row["length"]) - 1
 
 
+def test_any_environment_of_torchrl_trains_and_resumes_by_its_target(tmp_path: Path) -> None:
+    make = ["env.make._target_=torchrl.envs.GymEnv", "+env.make.env_name=Pendulum-v1"]
+    words = [*SMOKE, "env=torchrl", "env.id=pendulum", *make]
+    run(tmp_path / "run", *words, "total_frames=128")
+    resume(tmp_path / "run", "total_frames=256")
+    (row, *_) = read_table(tmp_path / "run" / "metrics.csv")
+    assert row["missing_ratio"]
+    with pytest.raises(UserError, match=r"`env.observation_keys` .* observation; got x\.$"):
+        run(tmp_path / "other", *words, "env.observation_keys=[x]")
+
+
 @pytest.mark.parametrize(
     ("name", "file", "words"),
     [

@@ -60,7 +60,7 @@ class Training:
 
         ``simulators``: whether their state is worth keeping; not where they have failed.
         """
-        keeps = simulators and self.env.base_env.supports_state
+        keeps = simulators and getattr(self.env.base_env, "supports_state", False)
         return {
             "agent": self.agent.state_dict(),
             **self.algorithm.state_dict(),
