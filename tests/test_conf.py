@@ -29,7 +29,7 @@ CHOICES = sorted(
 
 @pytest.mark.parametrize(("group", "name"), CHOICES, ids=lambda value: value)
 def test_every_choice_of_every_group_composes_and_passes_the_checks(group: str, name: str) -> None:
-    own = ["env.make._target_=x"] if name == "torchrl" else []
+    own = ["env.id=x", "env.make._target_=x"] if name == "torchrl" else []
     config = make_config(f"{group}={name}", *own)
     assert config.optim.lr > 0
 
