@@ -58,6 +58,11 @@ def run(config: dict[str, Any]) -> int:
         raise UserError("`belief.pretrained` is what this command makes; leave it out.")
     if config["belief"].get("mask_model"):
         raise UserError("`belief.mask_model` must be false: what is hidden here has no reason.")
+    if "transition" not in config["belief"]:
+        name = config["belief"]["name"]
+        raise UserError(
+            f"`belief` must be drbpn or drbpn_propagated, a Gaussian filter, got {name}."
+        )
     if config["out"] is None or Path(config["out"]).is_file():
         raise UserError(f"`out` must be a folder, such as fits/arm, got {config['out']}.")
     log = read_log(
@@ -112,7 +117,7 @@ def run(config: dict[str, Any]) -> int:
     overall = table[table["component"] == "all"].drop(columns=["component", "rmse"])
     say(overall.to_string(index=False, float_format="%.3f", na_rep=""))
     start = override("belief.pretrained", out / "filter.safetensors")
-    say(f"written: {out}; an agent starts from it by {start}")
+    say(f"written: {out}; an agent starts from it by belief={config['belief']['name']} {start}")
     return 0
 
 
@@ -129,10 +134,7 @@ def _fitted(
     config: dict[str, Any],
 ) -> BeliefFilter:
     sizes = {"obs_dim": data.observation.shape[-1], "action_dim": data.previous_action.shape[-1]}
-    module: Any = build("belief", settings, **sizes).module
-    belief_filter = getattr(module, "filter", None)
-    if not isinstance(belief_filter, BeliefFilter):
-        raise UserError(f"`belief` must be a Gaussian filter, got {settings['name']}.")
+    belief_filter: BeliefFilter = build("belief", dict(settings), **sizes).module.filter
     history = list(
         fit(
             belief_filter,

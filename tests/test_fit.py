@@ -123,6 +123,7 @@ def broken(table: pd.DataFrame, how: str) -> pd.DataFrame:
         ("", {"steps": 0}, "`steps` must be at least 1, got 0"),
         ("", {"hold_out": 1.5}, "`hold_out` must be in"),
         ("", {"hide": 0.9, "hide_length": 2}, "`hide`, `hide_length`: `mean_length` must be"),
+        ("", {"belief": {"name": "gru"}}, "`belief` must be drbpn or drbpn_propagated, .*got gru"),
         ("", {"belief": {"mask_model": True}}, "`belief.mask_model` must be false"),
         ("", {"belief": {"pretrained": "x"}}, "`belief.pretrained` is what this command makes"),
     ],
@@ -250,12 +251,13 @@ def test_an_agent_starts_from_the_filter_and_its_normalisation(
     }  # fmt: skip
     assert recipe.run(config) == 0
     path = tmp_path / "out" / "filter.safetensors"
-    started = agent_of(f"belief.pretrained={path}")
+    words = ("belief=drbpn_propagated", f"belief.pretrained={path}")
+    started = agent_of(*words)
     for name, value in load_file(path).items():
         assert torch.equal(started[name], value), name
     assert started["norm.count"].min() > 10
     assert recipe_tools.run(
-        tmp_path / "run", "experiment=smoke", f"belief.pretrained={path}", "total_frames=128",
+        tmp_path / "run", "experiment=smoke", *words, "total_frames=128",
         "evaluation.final_episodes=0",
     ) == 0  # fmt: skip
     path.unlink()  # a run needs it once
@@ -264,6 +266,6 @@ def test_an_agent_starts_from_the_filter_and_its_normalisation(
     assert load_trained_agent(tmp_path / "run").frames == 128
     assert recipe_tools.resume(tmp_path / "run", "total_frames=256") == 0
     with pytest.raises(UserError, match="does not fit the settings of this run"):
-        agent_of(f"belief.pretrained={fitted / 'filter.safetensors'}")
+        agent_of("belief=drbpn_propagated", f"belief.pretrained={fitted / 'filter.safetensors'}")
     with pytest.raises(UserError, match=r"`belief.pretrained` must be a file of recipes/fit.py"):
-        agent_of(f"belief.pretrained={path}")
+        agent_of(*words)
