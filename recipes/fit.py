@@ -60,9 +60,7 @@ def run(config: dict[str, Any]) -> int:
         raise UserError("`belief.mask_model` must be false: what is hidden here has no reason.")
     if "transition" not in config["belief"]:
         name = config["belief"]["name"]
-        raise UserError(
-            f"`belief` must be drbpn or drbpn_propagated, a Gaussian filter, got {name}."
-        )
+        raise UserError(f"`belief` must be drbpn or drbpn_propagated here, got {name}.")
     if config["out"] is None or Path(config["out"]).is_file():
         raise UserError(f"`out` must be a folder, such as fits/arm, got {config['out']}.")
     log = read_log(
