@@ -7,8 +7,13 @@ built without it.
 
 from __future__ import annotations
 
+import re
+import shutil
+import subprocess
 import warnings
+import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -194,3 +199,24 @@ def test_a_package_built_without_it_filters_in_pytorch_and_says_so_once(monkeypa
     with pytest.raises(ValueError, match="'native' cannot run here: the package was built without"):
         problem.library("native")
     filtering._warn_once.cache_clear()
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+@pytest.mark.parametrize("code", ["", "long abi_float(void) { return -1; }"], ids=["none", "other"])
+def test_a_library_of_another_abi_is_left_alone_and_says_to_rebuild(code, tmp_path):
+    source, built = tmp_path / "old.c", tmp_path / "_native_old.so"
+    source.write_text(f"long forward_float(void) {{ return 0; }} {code}")
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", built, source], check=True)
+    reason = native.load(built)
+    assert isinstance(reason, str)
+    assert "pip install -e ." in reason
+    assert "\n" not in reason
+
+
+def test_what_passes_between_python_and_c_has_an_abi_number_of_its_own():
+    """Where this fails: raise ABI in filter.h and in native.py, build, and write both here."""
+    files = sorted((Path(native.__file__).parents[1] / "csrc").glob("*.h"))
+    lines = [line for file in files for line in file.read_text().splitlines()]
+    number = next(int(line.split()[2]) for line in lines if line.startswith("#define ABI"))
+    passed = "".join(line for line in lines if re.search(r"\b[pd]\[|\bp \+", line))
+    assert (native._ABI, number, zlib.crc32("".join(passed.split()).encode())) == (1, 1, 1188242560)

@@ -32,6 +32,11 @@ typedef double real;
 #include "innovation.h"
 #include "information.h"
 
+/* Of what sizes, forward and backward are given, in number and order: raise it with them here and in
+ * functional/native.py, which loads no library of another number. */
+#define ABI 1
+int64_t NAME(abi)(void) { return ABI; }
+
 /* Reals that the caller allocates: tape, scratch of forward, scratch of backward. */
 void NAME(sizes)(const int64_t *dims, int64_t *out) {
     Sizes s = read_sizes(dims);

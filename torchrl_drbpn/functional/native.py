@@ -24,6 +24,7 @@ from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
 
 __all__ = ["filter_rows", "native_status", "operator_arguments", "unsupported_reason"]
 
+_ABI = 1  # of csrc/filter.h
 _KINDS = {torch.float32: "float", torch.float64: "double"}
 _WIDTHS = {"AVX512": "avx512", "AVX2": "avx2"}
 _MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
@@ -35,18 +36,25 @@ _TENSORS = 18  # arguments of the operator before the network's widths
 def _library() -> ctypes.CDLL | str:
     """Load what the build made for this processor; the reason where there is nothing."""
     width = _WIDTHS.get(torch.backends.cpu.get_cpu_capability(), "baseline")
-    folder = Path(__file__).parents[1]
     for name, suffix in itertools.product((width, "baseline"), EXTENSION_SUFFIXES):
-        path = folder / f"_native_{name}{suffix}"
+        path = Path(__file__).parents[1] / f"_native_{name}{suffix}"
         if path.is_file():
-            try:
-                return ctypes.CDLL(str(path))
-            except OSError as error:
-                return f"{path.name} cannot be loaded: {error}"
+            return load(path)
     return (
         "the package was built without it: install a C compiler, then the package again "
         "(in a checkout: python setup.py build_ext --inplace)"
     )
+
+
+def load(path: Path) -> ctypes.CDLL | str:
+    """Load a compiled library; the reason where it is none, or takes other arguments."""
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        return f"{path.name} cannot be loaded: {error}"
+    if getattr(library, "abi_float", int)() != _ABI:  # one without the number has none
+        return f"{path.name} is of another version than the Python beside it: run pip install -e ."
+    return library
 
 
 def native_status() -> str | None:
