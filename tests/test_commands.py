@@ -17,7 +17,7 @@ from training.config import command
 from training.errors import UserError
 
 NO_RUN = "`run` must name "
-COMMANDS = ("evaluate", "diagnose", "play", "plot_sensors", "report", "save_agent")
+COMMANDS = ("evaluate", "diagnose", "export", "play", "plot_sensors", "report", "save_agent")
 
 
 @pytest.mark.parametrize(

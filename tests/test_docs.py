@@ -182,10 +182,11 @@ def blocks_of(page: Path, language: str = "python") -> list[str]:
     [
         (blocks_of(GUIDE), SCRIPT),
         (blocks_of(FAULTS), SIMULATOR),
+        (blocks_of(DOCS / "deploy.md"), DOCS / "deploy" / "control_loop.py"),
         (blocks_of(EXTENDING)[:1], EXAMPLE / "drift.py"),
         (blocks_of(EXTENDING)[1:], EXAMPLE / "cautious.py"),
     ],
-    ids=["guide", "faults", "transform", "loss"],
+    ids=["guide", "faults", "deploy", "transform", "loss"],
 )
 def test_the_blocks_of_a_page_are_the_script_and_all_of_it(blocks, script):
     rest = script.read_text(encoding="utf-8")

@@ -1,0 +1,161 @@
+"""One file for a robot: it decides as the agent does, whoever runs it.
+
+Specified here: every format gives the agent's actions, NaN and a False mask are the same; what can
+not be exported is one line and leaves no file; the programs of docs/deploy walk with an agent that
+was exported, in Python without TorchRL, without torch, and in C++.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("hydra")
+pytest.importorskip("matplotlib")
+from evaluation_tools import ROOT, configured  # isort: skip
+
+import export as recipe
+from training.errors import UserError
+
+DEPLOY = ROOT / "docs" / "deploy"
+WALKER = ROOT / "agents" / "walker2d"
+onnx = pytest.mark.skipif(
+    not all(map(recipe.importlib.util.find_spec, recipe.PACKAGES)), reason="needs the extra onnx"
+)
+compiled = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+KINDS = [
+    pytest.param("export", "p.pt2", id="export"),
+    pytest.param("onnx", "p.onnx", id="onnx", marks=onnx),
+    pytest.param("aoti", "p.pt2", id="aoti", marks=[compiled, pytest.mark.slow]),
+]
+
+
+def exported(run: Path, out: Path, **changes: Any) -> Path:
+    changes = {"steps": 60, "calls": 20} | changes
+    assert recipe.run(configured("export") | {"run": str(run), "out": str(out)} | changes) == 0
+    return out
+
+
+@pytest.mark.parametrize("belief", ["drbpn", "drbpn_propagated"])
+@pytest.mark.parametrize(("kind", "name"), KINDS)
+def test_a_file_decides_as_the_agent_with_nan_or_a_mask(
+    trained_run: Callable[..., Path], tmp_path: Path, capsys: Any, belief: str, kind: str, name: str
+) -> None:
+    run = trained_run(belief)
+    out = exported(run, tmp_path / name, format=kind, robots=2)
+    printed = capsys.readouterr().out
+    steps, missing, largest, difference = re.search(
+        r"(\d+) steps, episodes \d+, missing ([\d.]+): actions, at most ([\d.e-]+), differ from "
+        r"the agent's by at most ([\d.e-]+)",
+        printed,
+    ).groups()  # type: ignore[union-attr]
+    assert steps == "120"
+    assert 0.2 < float(missing) < 0.6
+    assert float(difference) < 1e-4 * float(largest)
+    assert re.search(r"a decision takes [\d,]+ us", printed)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    decide, g = recipe.load(kind, out), torch.Generator().manual_seed(0)
+    x, seen = torch.randn(2, 4, generator=g), torch.tensor([[True, False, True, False]] * 2)
+    rest = [torch.zeros(2, 1), torch.zeros(2, 1, dtype=torch.bool), torch.randn(2, 4, generator=g)]
+    rest.append(torch.ones(2, 1, dtype=torch.int64))
+    if belief == "drbpn_propagated":
+        rest.append(0.1 * torch.eye(4).expand(2, 4, 4).contiguous())
+    masked = decide(x.where(seen, 1e9), seen, *rest)
+    as_nan = decide(x.where(seen, torch.nan), torch.ones_like(seen), *rest)
+    assert as_nan[4].tolist() == [[2], [2]]  # rejected
+    for i in (0, 1, 2, 3, *range(5, len(masked))):
+        torch.testing.assert_close(as_nan[i], masked[i], rtol=0, atol=0)
+    assert not torch.equal(decide(x, torch.ones_like(seen), *rest)[0], masked[0])
+
+
+@pytest.mark.parametrize(
+    ("belief", "changes", "line"),
+    [
+        ("drbpn", {"run": None}, "`run` must name a run folder"),
+        ("drbpn", {"run": str(DEPLOY)}, "`.*deploy` must be a run folder with config.yaml"),
+        ("drbpn", {"out": "policy.bin"}, "`out` must end in .pt2 for format=aoti, got policy.bin"),
+        ("drbpn", {"out": "p.pt2", "format": "onnx"}, "`out` must end in .onnx for format=onnx"),
+        ("drbpn", {"format": "tflite"}, "`format` must be aoti, export or onnx, got 'tflite'"),
+        ("drbpn", {"out": "nowhere/policy.pt2"}, "`out` must lie in an existing folder"),
+        ("drbpn", {"robots": 0}, "`robots` must be at least 1, got 0"),
+        ("gru", {"format": "export"}, "`run` must hold a belief filter .* got belief=gru"),
+        ("none", {"format": "export"}, "`run` must hold a belief filter .* got belief=none"),
+        pytest.param("drbpn", {"out": "p.onnx", "robust": "huber"},
+                     "`format=onnx`: `sequential` needs .*`robust` None", marks=onnx),
+    ],
+)  # fmt: skip
+def test_what_can_not_be_exported_is_one_line_and_no_file(
+    trained_run: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    belief: str, changes: dict[str, Any], line: str,
+) -> None:  # fmt: skip
+    run = str(trained_run(belief))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=line) as caught:
+        recipe.run(configured("export") | {"run": run, "steps": 4} | changes)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@onnx
+def test_a_full_noise_covariance_has_no_onnx_form(
+    trained_run: Callable[..., Path], tmp_path: Path
+) -> None:
+    run = trained_run("drbpn", "belief.emission.cov=full")
+    with pytest.raises(UserError, match="`format=onnx`: `sequential` needs a diagonal emission"):
+        exported(run, tmp_path / "p.onnx")
+    exported(run, tmp_path / "p.pt2", format="export")
+
+
+def test_a_missing_package_and_a_missing_compiler_are_named(
+    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recipe, "PACKAGES", ("numpy", "no_such_onnx"))
+    with pytest.raises(UserError, match="needs no_such_onnx: pip install no_such_onnx"):
+        exported(drbpn, tmp_path / "p.onnx")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=r"`format=aoti` needs a C\+\+ compiler.*format=export"):
+        exported(drbpn, tmp_path / "p.pt2")
+
+
+def walked(script: str, policy: Path) -> float:
+    """The return of a program of docs/deploy, which must import nothing of ours."""
+    text = (DEPLOY / script).read_text()
+    tree = ast.walk(ast.parse(text))
+    modules = {alias.name for node in tree if isinstance(node, ast.Import) for alias in node.names}
+    runtime = "onnxruntime" if policy.suffix == ".onnx" else "torch"
+    assert modules == {"sys", "gymnasium", "numpy", runtime}
+    done = subprocess.run(
+        [sys.executable, str(DEPLOY / script), str(policy)],
+        capture_output=True, text=True, timeout=300, check=True, cwd=policy.parent,
+    )  # fmt: skip
+    return float(re.findall(r"return (-?\d+)", done.stdout)[0])
+
+
+@onnx
+def test_the_program_without_torch_walks(tmp_path: Path) -> None:
+    assert walked("control_loop_onnx.py", exported(WALKER, tmp_path / "policy.onnx")) > 3000
+
+
+@pytest.mark.slow
+@compiled
+def test_the_programs_in_python_and_in_c_walk_and_decide(tmp_path: Path) -> None:
+    policy = exported(WALKER, tmp_path / "policy.pt2")
+    assert walked("control_loop.py", policy) > 3000
+    page = (ROOT / "docs" / "deploy.md").read_text()
+    (build,) = re.findall(r"```bash\n(T=.*?)```", page, re.DOTALL)
+    build = build.replace("docs/deploy/", f"{DEPLOY}/").replace("python ", f"{sys.executable} ")
+    done = subprocess.run(
+        ["bash", "-ec", build], capture_output=True, text=True, timeout=600, cwd=tmp_path,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert re.search(r"step 9999, first motor -?\d\.\d+\n[\d.]+ us a step", done.stdout)
