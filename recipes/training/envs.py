@@ -84,9 +84,10 @@ def make_simulators(
     num_envs: int,
     num_threads: int,
     backend: str,
-    observation_keys: Sequence[str] | None,
-    wrappers: Sequence[Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]],
     kwargs: Mapping[str, Any],
+    # Of runs that do not name them:
+    observation_keys: Sequence[str] | None = None,
+    wrappers: Sequence[Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]] = (),
 ) -> EnvBase:
     """Build many simulators of a Gymnasium task, see conf/env/gym.yaml."""
     backends = {"gymnasium": GymnasiumBatchEnv, "envpool": EnvPoolBatchEnv}
