@@ -11,6 +11,7 @@ import contextlib
 import sys
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,9 @@ def assemble(config: DictConfig) -> Training:
     return Training(
         env=env,
         agent=agent,
-        collector=build("collector", config.collector, env, agent.policy),
+        collector=build(
+            "collector", config.collector, env, agent.policy, partial(make_env, config)
+        ),
         gae=gae,
         algorithm=build(
             "algo", config.algo, agent, loss=loss, steps=steps, gae=gae, seed=config.seed
@@ -84,7 +87,7 @@ def collect(training: Training) -> TensorDictBase:
             warnings.filterwarnings("ignore", "MuJoCo gave up the state", RuntimeWarning)
             # The collector writes every rollout into the same tensors: what is entered is ours.
             data = training.collector.rollout().copy()
-    except (BeliefDivergedError, LinAlgError):
+    except (BeliefDivergedError, LinAlgError, UserError):
         raise
     except Exception as error:  # whatever a simulator raises
         raise EnvironmentFault(f"the environment failed: {one_line(error)}") from error
@@ -161,7 +164,7 @@ def train(config: DictConfig, folder: Path) -> int:
             if frames >= config.total_frames and is_evaluated(folder, config):
                 say(f"`{folder}` is at its end; more total_frames go on with it")
                 return 0
-            if not getattr(training.env.base_env, "supports_state", False):
+            if not training.keeps_simulators:
                 say(f"{env_name(config)} can't save its state here: going on with new episodes")
         log = RunLog(folder, config, list(training.agent.summary()), frames, evaluated)
         write_config(folder, config)

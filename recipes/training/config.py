@@ -36,6 +36,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("seed", "evaluation.seed"), (0, 2**63 - 1)),
     **dict.fromkeys(("threads", "env.num_threads"), (1, 256)),
     **dict.fromkeys(("total_frames", "collector.num_envs", "collector.steps_per_env"), (1, inf)),
+    **dict.fromkeys(("collector.workers", "collector.cpus_per_worker"), (1, inf)),
     **dict.fromkeys(("optim.epochs", "optim.minibatches", "optim.sequence_length"), (1, inf)),
     **dict.fromkeys(("checkpoint.every_frames", "checkpoint.keep"), (1, inf)),
     **dict.fromkeys(("evaluation.every_frames", "evaluation.episodes"), (0, inf)),

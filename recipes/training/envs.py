@@ -214,7 +214,12 @@ def _groups(id: str, version: str | None, by: str) -> list[list[int]] | None:
 
 
 def make_collector(
-    env: TransformedEnv, policy: TensorDictModuleBase, *, num_envs: int, steps_per_env: int
+    env: TransformedEnv,
+    policy: TensorDictModuleBase,
+    _: Callable[..., TransformedEnv],
+    *,
+    num_envs: int,
+    steps_per_env: int,
 ) -> Collector:
     """Make TorchRL's collector of one rollout after the other."""
     return Collector(

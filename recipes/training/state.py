@@ -60,7 +60,7 @@ class Training:
 
         ``simulators``: whether their state is worth keeping; not where they have failed.
         """
-        keeps = simulators and getattr(self.env.base_env, "supports_state", False)
+        keeps = simulators and self.keeps_simulators
         return {
             "agent": self.agent.state_dict(),
             **self.algorithm.state_dict(),
@@ -104,9 +104,18 @@ class Training:
                 self.start_episodes()
 
     @property
+    def keeps_simulators(self) -> bool:
+        """Return whether a checkpoint holds the simulators: those of this process, if they can."""
+        return isinstance(self.collector, Collector) and bool(
+            getattr(self.env.base_env, "supports_state", False)
+        )
+
+    @property
     def engine_resets(self) -> int:
         """Return how many episodes a physics engine has cut off by resetting itself."""
-        return int(getattr(self.env.base_env, "engine_resets", torch.zeros(1)).sum())
+        here = isinstance(self.collector, Collector)
+        counter = self.env.base_env if here else self.collector
+        return int(getattr(counter, "engine_resets", torch.zeros(1)).sum())
 
     def start_episodes(self) -> None:
         """Begin new episodes in every environment."""

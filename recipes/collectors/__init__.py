@@ -1,0 +1,1 @@
+"""Where rollouts come from, other than from this process."""
