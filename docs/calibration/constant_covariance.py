@@ -116,7 +116,9 @@ def trained_cov(
     for _ in range(iterations):
         learned = replace(model, transition_cov=full_cov(raw, MIN_STD))
         start = model.initial_mean.expand(len(observation), -1)
-        out = filter_sequence(learned, start, action, observation, observed, reset)
+        given = {} if model.transition_jacobian is None else {"cov": model.full_initial_cov()}
+        cov = {k: x.expand(len(observation), -1, -1) for k, x in given.items()}
+        out = filter_sequence(learned, start, action, observation, observed, reset, **cov)
         optimiser.zero_grad()
         (-out.log_likelihood.sum() / observed.sum()).backward()
         optimiser.step()

@@ -135,7 +135,7 @@ def load_trained_agent(
             f"`robust` must be null for belief={config.belief.name}, got {robust!r}: "
             "only belief=drbpn has a forecast of its readings to compare them with."
         )
-    update = None if robust == "none" else robust
+    update: Any = None if robust == "none" else robust
     try:
         check_robust(update, threshold)
     except ValueError as error:
