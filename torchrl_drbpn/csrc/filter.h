@@ -1,6 +1,6 @@
 /* The belief filter over [batch, time] and its reverse pass as two functions, for a constant Q, eq.
- * (8), (10), (12) [DRBPN]. The same sums as functional/filtering.py, where PyTorch needs some hundred
- * small operations a minibatch. filter_float.c and filter_double.c compile it, once for each `given`:
+ * (8), (10), (12) [DRBPN]. The same sums as functional/pytorch_form.py, where PyTorch needs some
+ * hundred small operations a minibatch. filter_float.c and filter_double.c compile it, once for each `given`:
  *
  *   linalg.h       vectors, matrix products, many small inverses at once
  *   memory.h       sizes and where everything lies

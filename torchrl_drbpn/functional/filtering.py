@@ -1,15 +1,10 @@
 """A whole sequence through the belief filter, and one step of it.
 
-Two forms give the same numbers. The PyTorch form here is plain autograd on any device and under
-every transformation; :mod:`.native` is one operator on the CPU. :func:`.unsupported_reason` is the
-rule which runs.
-
-Where Q is constant, predicted covariances depend on the episode starts alone, so that the gains of
-a whole minibatch are one batched computation ahead of the mean recurrence. Where they are
-propagated by one Jacobian they depend on masks and episode starts: their recursion runs before,
-without gradient. The gain comes from what is cheaper to factorise: S = H P H' + R, obs x obs, or
-the precision inv(P) + H' inv(R) H, state x state (diagonal R, obs > state). A Q or a Jacobian that
-depends on the state, or a model of the mask, takes :mod:`.kalman` step by step.
+Two forms give the same numbers: :mod:`.pytorch_form`, plain autograd on any device and under every
+transformation, and :mod:`.native`, one operator on the CPU; :func:`.unsupported_reason` is the rule
+which runs. Where Q is constant, predicted covariances depend on the episode starts alone; where
+they are propagated by one Jacobian, on masks too: in both they are known ahead of the means. A Q or
+a Jacobian that depends on the state, or a model of the mask, is filtered step by step.
 """
 
 from __future__ import annotations
@@ -17,38 +12,25 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional import native
-from torchrl_drbpn.functional.gaussian import (
-    LOG_2PI,
-    Belief,
-    masked_cov,
-    rounded_cov,
-    without_autocast,
-    zero_missing,
+from torchrl_drbpn.functional.gaussian import Belief, without_autocast
+from torchrl_drbpn.functional.kalman import update
+from torchrl_drbpn.functional.pytorch_form import (
+    Rows,
+    run_in_pytorch,
+    run_step_by_step,
+    weighted_noise,
 )
-from torchrl_drbpn.functional.informative import update_by_mask
-from torchrl_drbpn.functional.kalman import log_likelihood, update
-from torchrl_drbpn.functional.state_space import StateSpace, predict_step, propagate
+from torchrl_drbpn.functional.state_space import StateSpace, propagate
 
 __all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
 
 Form = Literal["auto", "pytorch", "native"]
-# observation, observed, action, reset, use_stored_state, stored_mean as (batch, time, ...), the
-# mean (batch, state) before; stored_cov and the cov before where it is propagated; weight.
-Sequence = tuple[
-    Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor, Tensor | None,
-    Tensor | None, Tensor | None,
-]  # fmt: skip
-# Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step; leaves alone
-# what is there for every step.
-Choose = Callable[[Tensor], Tensor]
-Gains = tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]
 
 
 class FilterOutput(NamedTuple):
@@ -106,13 +88,15 @@ def filter_step(
     model.check_inputs(
         steps, steps, mean, previous_action, observation, observed, reset, cov=cov, weight=weight
     )
-    out = _filter(
-        model,
-        (observation.unsqueeze(-2), observed.unsqueeze(-2), previous_action.unsqueeze(-2),
-         reset.unsqueeze(-1), None, None, mean, None, cov,
-         None if weight is None else weight.unsqueeze(-2)),
-        return_cov, form,
+    observation, observed, previous_action = (
+        x.unsqueeze(-2) for x in (observation, observed, previous_action)
+    )
+    weight = None if weight is None else weight.unsqueeze(-2)
+    given = Rows(
+        observation, observed, previous_action, reset.unsqueeze(-1), None, None, mean, None, cov,
+        weight,
     )  # fmt: skip
+    out = _filter(model, given, return_cov, form)
     filtered = None if out.cov is None else out.cov.squeeze(-3)
     return FilterOutput(out.mean.squeeze(-2), filtered, out.log_likelihood.squeeze(-1))
 
@@ -188,57 +172,50 @@ def filter_sequence(
         steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
         stored_mean, stored_cov, cov, weight,
     )  # fmt: skip
-    return _filter(
-        model, (observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
-                stored_cov, cov, weight),
-        return_cov, form,
+    given = Rows(
+        observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
+        stored_cov, cov, weight,
     )  # fmt: skip
+    return _filter(model, given, return_cov, form)
 
 
-def _filter(model: StateSpace, given: Sequence, return_cov: bool, form: Form) -> FilterOutput:
+def _filter(model: StateSpace, given: Rows, return_cov: bool, form: Form) -> FilterOutput:
     """Choose the form, and filter checked inputs as rows."""
     if form not in ("auto", "pytorch", "native"):
         raise ValueError(f"`form` must be 'auto', 'pytorch' or 'native', got {form!r}.")
-    F = model.transition_jacobian
-    needed = (("stored_cov", given[7], given[4] is not None), ("cov", given[8], True))
-    for name, value, always in needed if F is not None else ():
-        if always and value is None:
-            raise ValueError(
-                f"`{name}` is None, but this model propagates its covariance: pass the filtered "
-                "covariance beside the mean."
-            )
-    if F is None:
-        given = (*given[:7], None, None, given[9])
-    if (weight := given[9]) is not None:
-        observed = given[1] & (weight != 0)
-        given = (given[0], observed, *given[2:9], torch.where(observed, weight.detach(), 1.0))
-    *batch, time = given[3].shape
-
-    def rows(x: Tensor | None) -> Tensor | None:  # not -1: there may be no step at all
-        return None if x is None else x.reshape(math.prod(batch), *x.shape[len(batch) :])
-
-    sequence: Sequence = tuple(map(rows, given))  # type: ignore[assignment]
+    if (F := model.transition_jacobian) is None:
+        given = given._replace(cov=None, stored_cov=None)
+    elif given.cov is None or (given.use_stored_state is not None and given.stored_cov is None):
+        raise ValueError(
+            f"`{'cov' if given.cov is None else 'stored_cov'}` is None, but this model propagates "
+            "its covariance: pass the filtered covariance beside the mean."
+        )
+    if (weight := given.weight) is not None:
+        observed = given.observed & (weight != 0)
+        weight = torch.where(observed, weight.detach(), 1.0)
+        given = given._replace(observed=observed, weight=weight)
+    *batch, time = given.reset.shape
+    # Not -1: there may be no step at all.
+    rows = Rows(*(
+        None if x is None else x.reshape(math.prod(batch), *x.shape[len(batch) :]) for x in given
+    ))  # type: ignore[arg-type]  # fmt: skip
     reason: str | None = "PyTorch was asked for"
     if form != "pytorch":
-        reason = native.unsupported_reason(model, given[0], given[2], *given[5:9])
+        reason = native.unsupported_reason(model, given.observation, given.action, *given[5:9])
         reason = "it takes no weights" if reason is None and weight is not None else reason
         if reason is not None and form == "native":
             raise ValueError(f"`form` 'native' cannot run here: {reason}. Use form='auto'.")
         if not torch.compiler.is_compiling() and reason and reason == native.native_status():
             _warn_once(reason)
-    with without_autocast(given[6]):
+    with without_autocast(given.mean):
         cov: Tensor | None
         if not isinstance(model.transition_cov, Tensor) or callable(F) or model.mask_model:
-            filtered, cov, ll = _run_step_by_step(model, *sequence)
+            filtered, cov, ll = run_step_by_step(model, rows)
         else:
-            if reason is None:
-                filtered, cov, ll = native.filter_rows(model, *sequence[:9])
-            else:
-                filtered, cov, ll = run_in_pytorch(model, *sequence)
-            if return_cov and cov is None:
-                cov = filtered_cov(model, sequence[1], sequence[3], sequence[9])
-            elif return_cov and cov is not None:
-                cov = _differentiable_cov(model, sequence, cov)
+            run = run_in_pytorch if reason is not None else native.filter_rows
+            filtered, cov, ll = run(model, rows)
+            if return_cov:
+                cov = _filtered_cov(model, rows, cov)
     if cov is not None and not return_cov:
         cov = None if F is None else cov.detach()
     cov = None if cov is None else cov.reshape(*batch, *cov.shape[1:])
@@ -289,255 +266,21 @@ def filtered_cov(
             "`model` has a covariance that depends on the whole past: ask "
             "filter_sequence or filter_step for it."
         )
-    P = torch.where(reset[..., None, None], model.full_initial_cov(), model.constant_cov())
-    return _updated_cov(model, P, observed, weight)
+    nothing = observed.new_zeros((), dtype=model.initial_mean.dtype)  # only the masks are read
+    rows = Rows(nothing, observed, nothing, reset, None, None, nothing, weight=weight)
+    return _filtered_cov(model, rows, None)
 
 
-def _updated_cov(model: StateSpace, P: Tensor, observed: Tensor, weight: Tensor | None) -> Tensor:
+def _filtered_cov(model: StateSpace, rows: Rows, filtered: Tensor | None) -> Tensor:
+    """Return covariances with the gradient of one step: a propagated one before is a constant."""
+    first, F, P = rows.reset[..., None, None], model.transition_jacobian, model.constant_cov()
+    if filtered is not None and rows.cov is not None and isinstance(F, Tensor):
+        before = torch.cat([rows.cov.unsqueeze(1), filtered], 1)[:, :-1]
+        if rows.use_stored_state is not None and rows.stored_cov is not None:
+            before = torch.where(rows.use_stored_state[..., None, None], rows.stored_cov, before)
+        P = propagate(F, before.masked_fill(first, 0.0)) + P
+    P = torch.where(first, model.full_initial_cov().to(P.dtype), P).to(model.initial_mean.dtype)
     zero = torch.zeros((), dtype=P.dtype, device=P.device)
-    predicted = Belief(zero.expand(P.shape[:-1]), P)
-    H, R = model.emission_matrix, _weighted_noise(model, weight)
-    return update(predicted, zero.expand(observed.shape), observed, H, R).cov
-
-
-def _added_noise(R: Tensor, weight: Tensor) -> Tensor:
-    """Return what weights add to the diagonal of R, float64; exactly 0 for a weight of 1."""
-    return (R if R.ndim == 1 else R.diagonal()).double() * (1.0 / weight.double() - 1.0)
-
-
-def _weighted_noise(model: StateSpace, weight: Tensor | None) -> Tensor:
-    """Return R, or of every step the matrix that its weights make of it."""
-    R = model.emission_cov
-    if weight is None:
-        return R
-    return model.full_emission_cov() + torch.diag_embed(_added_noise(R, weight))
-
-
-def _differentiable_cov(model: StateSpace, sequence: Sequence, filtered: Tensor) -> Tensor:
-    """Return propagated covariances with the gradient of one step: that before is a constant."""
-    _, observed, _, reset, use_stored_state, _, _, stored_cov, cov, weight = sequence
-    F = model.transition_jacobian
-    assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
-    before = torch.cat([cov.unsqueeze(1), filtered], 1)[:, :-1]
-    if use_stored_state is not None and stored_cov is not None:
-        before = torch.where(use_stored_state[..., None, None], stored_cov, before)
-    first = reset[..., None, None]
-    moved = propagate(F, before.masked_fill(first, 0.0)) + model.constant_cov()
-    P = torch.where(first, model.full_initial_cov().double(), moved)
-    return _updated_cov(model, P.to(filtered.dtype), observed, weight)
-
-
-# ------------------------------------------------------------------ the PyTorch form
-def run_in_pytorch(
-    model: StateSpace,
-    observation: Tensor,
-    observed: Tensor,
-    action: Tensor,
-    reset: Tensor,
-    use_stored_state: Tensor | None,
-    stored_mean: Tensor | None,
-    mean: Tensor,
-    stored_cov: Tensor | None = None,
-    cov: Tensor | None = None,
-    weight: Tensor | None = None,
-) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Filter rows ``(batch, time, ...)``; return means, propagated covariances, log-likelihoods.
-
-    In float64 but for the transition: with R at its floor float32 loses most digits of a gain.
-    """
-    H, R, dtype = model.emission_matrix.double(), model.emission_cov.double(), mean.dtype
-    added = None if weight is None else _added_noise(R, weight)
-    covs = torch.stack([model.full_initial_cov(), model.constant_cov()]).double()
-
-    def choose(pair: Tensor) -> Tensor:
-        first = reset.view(*reset.shape, *(1,) * (pair.ndim - 1))
-        return torch.where(first, pair[0], pair[1])
-
-    filtered_covs = None
-    if model.transition_jacobian is not None:
-        own = choose(covs)
-        covs, filtered_covs = _run_covariances(
-            model, own, observed, added, reset, use_stored_state, stored_cov, cov
-        )
-        filtered_covs = rounded_cov(filtered_covs, dtype)
-
-        def choose(pair: Tensor) -> Tensor:
-            return pair
-
-    gains = _information if model.information_form else _innovation
-    gain, likelihood = gains(H, R, covs, choose, observed, added)
-    # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
-    y = zero_missing(observation, observed).double() - model.offset(action).double()
-    innovations, moves, filtered, H_t = [], [], [], H.mT
-    steps = (y, gain, action, reset.unsqueeze(-1), use_stored_state, stored_mean)
-    for y_t, gain_t, action_t, reset_t, use_t, stored_t in zip(
-        *((None,) * reset.shape[1] if x is None else x.unbind(1) for x in steps), strict=True
-    ):
-        if use_t is not None:
-            mean = torch.where(use_t.unsqueeze(-1), stored_t, mean)
-        m = model.predicted_mean(mean, action_t, reset_t).double()
-        v = torch.addmm(y_t, m, H_t, alpha=-1)
-        move = torch.bmm(gain_t, v.unsqueeze(-1)).squeeze(-1)
-        mean = (m + move).to(dtype)
-        innovations.append(v)
-        moves.append(move)
-        filtered.append(mean)
-    if not filtered:
-        return mean.unsqueeze(1)[:, :0], filtered_covs, y.sum(-1).to(dtype)
-    residual = zero_missing(torch.stack(innovations, 1), observed)
-    ll = torch.where(observed.any(-1), likelihood(residual, moves), 0.0).to(dtype)
-    return torch.stack(filtered, 1), filtered_covs, ll
-
-
-def _run_covariances(
-    model: StateSpace,
-    own: Tensor,
-    observed: Tensor,
-    added: Tensor | None,
-    reset: Tensor,
-    use_stored_state: Tensor | None,
-    stored_cov: Tensor | None,
-    cov: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Propagate and update covariances ahead of the means; ``own`` is Q or P_0 of each step.
-
-    Returns:
-        The predicted ones, with the gradient by ``own`` alone, and the filtered ones, without;
-        float64, ``(batch, time, state, state)``.
-    """
-    F, time = model.transition_jacobian, reset.shape[1]
-    assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
-    H, R = model.emission_matrix.detach().double(), model.emission_cov.detach().double()
-    if R.ndim == 2 or not model.information_form:
-        R = model.full_emission_cov().detach().double()
-    if added is not None:
-        R = R + (added if R.ndim == 1 else torch.diag_embed(added)).detach()
-    value, sigma = own.detach(), cov.detach().double()
-    predicted, filtered = [], []
-    # The state before a step that starts anew, or from what is stored, comes from here.
-    given, ahead = reset, torch.zeros_like(value)
-    if use_stored_state is not None and stored_cov is not None:
-        given = reset | use_stored_state
-        ahead = stored_cov.detach().masked_fill(reset[..., None, None], 0.0).double()
-    if model.information_form:
-        weight = observed / R
-        outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
-        gained = (weight @ outer).view(value.shape)
-    else:
-        rows = zero_missing(H, observed.unsqueeze(-1))  # M'M H
-        noise = masked_cov(R, observed)
-    for t in range(time):
-        sigma = torch.where(given[:, t, None, None], ahead[:, t], sigma)
-        P = propagate(F, sigma) + value[:, t]
-        if model.information_form:
-            precision = torch.cholesky_inverse(torch.linalg.cholesky_ex(P)[0]) + gained[:, t]
-            sigma = torch.cholesky_inverse(torch.linalg.cholesky_ex(precision)[0])
-        else:
-            h = rows[:, t]
-            cross = h @ P
-            factor, _ = torch.linalg.cholesky_ex(torch.baddbmm(noise[:, t], cross, h.mT))
-            white = torch.linalg.solve_triangular(factor, cross, upper=False)
-            sigma = torch.baddbmm(P, white.mT, white, alpha=-1)
-        predicted.append(P)
-        filtered.append(sigma)
-    if not predicted:
-        return own, value
-    return torch.stack(predicted, 1) + (own - value), torch.stack(filtered, 1)
-
-
-def _innovation(
-    H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor, added: Tensor | None
-) -> Gains:
-    """Return the gains K = P H' M' inv(M S M') M and the log-likelihood, obs x obs factorised."""
-    full_R = R.diag() if R.ndim == 1 else R
-    cross = H @ covs
-    S = choose(cross @ H.mT + full_R)
-    S = S if added is None else S + torch.diag_embed(added)
-    factor, log_det = _factor(masked_cov(S, observed))
-    gain = torch.cholesky_solve(zero_missing(choose(cross), observed.unsqueeze(-1)), factor).mT
-
-    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
-        del moves
-        white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
-        count = observed.sum(-1).to(residual.dtype)  # an integer times a float would be float32
-        return -0.5 * (white.squeeze(-1).square().sum(-1) + log_det + count * LOG_2PI)
-
-    return gain, likelihood
-
-
-def _information(
-    H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor, added: Tensor | None
-) -> Gains:
-    r"""Return the gains K = inv(inv(P) + H' W H) H' W and the log-likelihood, W = diag(m / r).
-
-    .. math::
-        v' S^{-1} v = (v - H \delta)' W (v - H \delta) + \delta' P^{-1} \delta, \qquad
-        \log|S| = \textstyle\sum_i m_i \log r_i + \log|P| + \log|P^{-1} + H' W H|
-
-    with :math:`\delta = K v` and r plus what is added to it. Both terms of the quadratic form are
-    sums of squares, so that nothing cancels where R is small.
-    """
-    R = R if added is None else R + added
-    weight = observed / R
-    outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
-    prior_factor, prior_log_det = _factor(covs)
-    prior = choose(torch.cholesky_inverse(prior_factor))
-    factor, log_det = _factor((weight @ outer).view(prior.shape) + prior)
-    gain = torch.cholesky_solve((weight.unsqueeze(-1) * H).mT, factor)
-
-    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
-        move = torch.stack(moves, 1)
-        left = zero_missing(residual - move @ H.mT, observed)
-        by_prior = (prior @ move.unsqueeze(-1)).squeeze(-1)
-        quadratic = (weight * left.square()).sum(-1) + (move * by_prior).sum(-1)
-        log_noise = (observed * (R.log() + LOG_2PI)).sum(-1)
-        return -0.5 * (quadratic + log_noise + log_det + choose(prior_log_det))
-
-    return gain, likelihood
-
-
-def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Return Cholesky factor and log-determinant; NaN for a matrix that has none, by itself."""
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    spoilt = torch.where(info == 0, 0.0, torch.nan).to(matrix.dtype)[..., None, None]
-    factor = factor + spoilt
-    return factor, 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-
-
-def _run_step_by_step(
-    model: StateSpace,
-    observation: Tensor,
-    observed: Tensor,
-    action: Tensor,
-    reset: Tensor,
-    use_stored_state: Tensor | None,
-    stored_mean: Tensor | None,
-    mean: Tensor,
-    stored_cov: Tensor | None,
-    cov: Tensor | None,
-    weight: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Filter by :mod:`.kalman` at every step; return means, covariances, log-likelihoods."""
-    H, R, offset = model.emission_matrix, _weighted_noise(model, weight), model.offset(action)
-    means, covs, lls = [], [], []
-    for t in range(reset.shape[1]):
-        if use_stored_state is not None and stored_mean is not None:
-            use = use_stored_state[:, t, None]
-            mean = torch.where(use, stored_mean[:, t], mean)
-            if stored_cov is not None and cov is not None:
-                cov = torch.where(use.unsqueeze(-1), stored_cov[:, t], cov)
-        predicted = predict_step(model, mean, action[:, t], reset[:, t], cov)
-        noise = R if weight is None else R[:, t]
-        step = (observation[:, t], observed[:, t], H, noise, offset[:, t])
-        lls.append(log_likelihood(predicted, *step))
-        belief = update(predicted, *step)
-        if model.mask_model is not None:
-            belief, ll = update_by_mask(belief, *step, model.mask_model)
-            lls[-1] = lls[-1] + ll
-        mean, cov = belief
-        means.append(mean)
-        covs.append(cov)
-    if not means:
-        nothing = mean.unsqueeze(1)[:, :0]
-        return nothing, nothing.unsqueeze(-1) * nothing.unsqueeze(-2), nothing.sum(-1)
-    return torch.stack(means, 1), torch.stack(covs, 1), torch.stack(lls, 1)
+    predicted, noise = Belief(zero.expand(P.shape[:-1]), P), weighted_noise(model, rows.weight)
+    reading = zero.expand(rows.observed.shape)
+    return update(predicted, reading, rows.observed, model.emission_matrix, noise).cov

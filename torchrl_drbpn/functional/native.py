@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchrl_drbpn.functional.pytorch_form import Filtered, Rows, run_in_pytorch
 from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
 
 __all__ = ["filter_rows", "native_status", "operator_arguments", "unsupported_reason"]
@@ -114,11 +115,9 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     return native_status()
 
 
-def filter_rows(
-    model: StateSpace, *sequence: Tensor | None
-) -> tuple[Tensor, Tensor | None, Tensor]:
+def filter_rows(model: StateSpace, rows: Rows) -> Filtered:
     """Filter what :func:`unsupported_reason` has nothing against, as ``run_in_pytorch`` does."""
-    mean, ll, _, cov = torch.ops.torchrl_drbpn.filter_rows(*sequence, *operator_arguments(model))
+    mean, ll, _, cov = torch.ops.torchrl_drbpn.filter_rows(*rows[:9], *operator_arguments(model))
     return mean, None if model.transition_jacobian is None else cov, ll
 
 
@@ -328,11 +327,9 @@ class _Filter(torch.autograd.Function):
             )
             sequence = (x, None, action, None, None, stored[0] if stored else None, start)
             return (*sequence, None, None, Q, P0, R, H, B, d, m0, network, *(None,) * 4)
-        from torchrl_drbpn.functional.filtering import run_in_pytorch  # which imports this file
-
         Q, P0, R, H, B, d, m0, network, F = saved[9:]
         model = StateSpace(_unpacked(network, Q, B, *ctx.rest), Q, H, R, B, d, m0, P0, F)
-        outputs = run_in_pytorch(model, *saved[:9])[::2]
+        outputs = run_in_pytorch(model, Rows(*saved[:9]))[::2]
         pairs = [(o, g) for o, g in zip(outputs, by_outputs[:2], strict=True) if g is not None]
         values, weights = zip(*pairs, strict=True)
         wanted = [x for x in saved if x is not None and x.requires_grad]

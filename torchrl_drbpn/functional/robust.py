@@ -131,7 +131,7 @@ def robust_weights(
         >>> state = torch.zeros(3), torch.zeros(1)
         >>> x, seen = torch.tensor([100.0, 1.0, -1.0]), torch.ones(3, dtype=torch.bool)
         >>> w = robust_weights(model, *state, x, seen, torch.tensor(False), robust="huber")
-        >>> bool(w[0] < 0.02), w[1:].tolist()
+        >>> bool(w[0] < 0.03), w[1:].tolist()
         (True, [1.0, 1.0])
     """
     weights = robust_sequence_weights(

@@ -1,0 +1,247 @@
+"""The filter in PyTorch operations: any device, every transformation, differentiable again.
+
+Where predicted covariances do not depend on the mean, the gains of a whole minibatch are one
+batched computation ahead of the mean recurrence. The gain comes from what is cheaper to factorise:
+S = H P H' + R, obs x obs, or the precision inv(P) + H' inv(R) H, state x state (diagonal R,
+obs > state). Everything is float64 but the transition: with R at its floor float32 loses most
+digits of a gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional.gaussian import (
+    LOG_2PI,
+    masked_cov,
+    rounded_cov,
+    zero_missing,
+)
+from torchrl_drbpn.functional.informative import update_by_mask
+from torchrl_drbpn.functional.kalman import log_likelihood, update
+from torchrl_drbpn.functional.state_space import StateSpace, predict_step, propagate
+
+__all__ = ["Rows", "run_in_pytorch", "run_step_by_step", "weighted_noise"]
+
+# Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step; leaves alone
+# what is there for every step.
+Choose = Callable[[Tensor], Tensor]
+Gains = tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]
+Filtered = tuple[Tensor, Tensor | None, Tensor]  # means, covariances, log-likelihoods
+
+
+class Rows(NamedTuple):
+    """Checked arguments of :func:`filter_sequence`, all batch dimensions as one."""
+
+    observation: Tensor
+    observed: Tensor
+    action: Tensor
+    reset: Tensor
+    use_stored_state: Tensor | None
+    stored_mean: Tensor | None
+    mean: Tensor
+    stored_cov: Tensor | None = None
+    cov: Tensor | None = None
+    weight: Tensor | None = None
+
+    def before(self, t: int, mean: Tensor, cov: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Return the belief that step t starts from: the one before, or what is stored."""
+        if self.use_stored_state is None or self.stored_mean is None:
+            return mean, cov
+        use = self.use_stored_state[:, t, None]
+        if cov is not None and self.stored_cov is not None:
+            cov = torch.where(use.unsqueeze(-1), self.stored_cov[:, t], cov)
+        return torch.where(use, self.stored_mean[:, t], mean), cov
+
+
+def _added_noise(R: Tensor, weight: Tensor) -> Tensor:
+    """Return what weights add to the diagonal of R, float64; exactly 0 for a weight of 1."""
+    return (R if R.ndim == 1 else R.diagonal()).double() * (1.0 / weight.double() - 1.0)
+
+
+def weighted_noise(model: StateSpace, weight: Tensor | None) -> Tensor:
+    """Return R, or of every step the matrix that its weights make of it."""
+    R = model.emission_cov
+    if weight is None:
+        return R
+    return model.full_emission_cov() + torch.diag_embed(_added_noise(R, weight))
+
+
+def run_in_pytorch(model: StateSpace, rows: Rows) -> Filtered:
+    """Filter where predicted covariances do not depend on the mean.
+
+    Returns:
+        Means, covariances (without gradient) where they are propagated, log-likelihoods.
+    """
+    observed, reset, mean = rows.observed, rows.reset, rows.mean
+    H, R, dtype = model.emission_matrix.double(), model.emission_cov.double(), mean.dtype
+    added = None if rows.weight is None else _added_noise(R, rows.weight)
+    covs = torch.stack([model.full_initial_cov(), model.constant_cov()]).double()
+
+    def choose(pair: Tensor) -> Tensor:
+        first = reset.view(*reset.shape, *(1,) * (pair.ndim - 1))
+        return torch.where(first, pair[0], pair[1])
+
+    filtered_covs = None
+    if model.transition_jacobian is not None:
+        covs, filtered_covs = _run_covariances(model, rows, choose(covs), added)
+        filtered_covs = rounded_cov(filtered_covs, dtype)
+
+        def choose(pair: Tensor) -> Tensor:
+            return pair
+
+    gains = _information if model.information_form else _innovation
+    gain, likelihood = gains(H, R, covs, choose, observed, added)
+    # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
+    y = zero_missing(rows.observation, observed).double() - model.offset(rows.action).double()
+    innovations, moves, filtered, H_t = [], [], [], H.mT
+    steps = zip(*(x.unbind(1) for x in (y, gain, rows.action, reset.unsqueeze(-1))), strict=True)
+    for t, (y_t, gain_t, action_t, reset_t) in enumerate(steps):
+        mean, _ = rows.before(t, mean, None)
+        m = model.predicted_mean(mean, action_t, reset_t).double()
+        v = torch.addmm(y_t, m, H_t, alpha=-1)
+        move = torch.bmm(gain_t, v.unsqueeze(-1)).squeeze(-1)
+        mean = (m + move).to(dtype)
+        innovations.append(v)
+        moves.append(move)
+        filtered.append(mean)
+    if not filtered:
+        return mean.unsqueeze(1)[:, :0], filtered_covs, y.sum(-1).to(dtype)
+    residual = zero_missing(torch.stack(innovations, 1), observed)
+    ll = torch.where(observed.any(-1), likelihood(residual, moves), 0.0).to(dtype)
+    return torch.stack(filtered, 1), filtered_covs, ll
+
+
+def _run_covariances(
+    model: StateSpace, rows: Rows, own: Tensor, added: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Propagate and update covariances ahead of the means; ``own`` is Q or P_0 of each step.
+
+    Returns:
+        The predicted ones, with the gradient by ``own`` alone, and the filtered ones, without;
+        float64, ``(batch, time, state, state)``.
+    """
+    F, cov, given, observed = model.transition_jacobian, rows.cov, rows.reset, rows.observed
+    assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
+    H, R = model.emission_matrix.detach().double(), model.emission_cov.detach().double()
+    if not model.information_form:
+        R = model.full_emission_cov().detach().double()
+    if added is not None:
+        R = R + (added if R.ndim == 1 else torch.diag_embed(added)).detach()
+    value, sigma = own.detach(), cov.detach().double()
+    predicted, filtered = [], []
+    # The state before a step that starts anew, or from what is stored, comes from here.
+    ahead = torch.zeros_like(value)
+    if rows.use_stored_state is not None and rows.stored_cov is not None:
+        ahead = rows.stored_cov.detach().masked_fill(given[..., None, None], 0.0).double()
+        given = given | rows.use_stored_state
+    if model.information_form:
+        weight = observed / R
+        outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
+        gained = (weight @ outer).view(value.shape)
+    else:
+        arrived = zero_missing(H, observed.unsqueeze(-1))  # M'M H
+        noise = masked_cov(R, observed)
+    for t in range(observed.shape[1]):
+        sigma = torch.where(given[:, t, None, None], ahead[:, t], sigma)
+        P = propagate(F, sigma) + value[:, t]
+        if model.information_form:
+            precision = torch.cholesky_inverse(torch.linalg.cholesky_ex(P)[0]) + gained[:, t]
+            sigma = torch.cholesky_inverse(torch.linalg.cholesky_ex(precision)[0])
+        else:
+            h = arrived[:, t]
+            cross = h @ P
+            factor, _ = torch.linalg.cholesky_ex(torch.baddbmm(noise[:, t], cross, h.mT))
+            white = torch.linalg.solve_triangular(factor, cross, upper=False)
+            sigma = torch.baddbmm(P, white.mT, white, alpha=-1)
+        predicted.append(P)
+        filtered.append(sigma)
+    if not predicted:
+        return own, value
+    return torch.stack(predicted, 1) + (own - value), torch.stack(filtered, 1)
+
+
+def _innovation(
+    H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor, added: Tensor | None
+) -> Gains:
+    """Return the gains K = P H' M' inv(M S M') M and the log-likelihood, obs x obs factorised."""
+    full_R = R.diag() if R.ndim == 1 else R
+    cross = H @ covs
+    S = choose(cross @ H.mT + full_R)
+    S = S if added is None else S + torch.diag_embed(added)
+    factor, log_det = _factor(masked_cov(S, observed))
+    gain = torch.cholesky_solve(zero_missing(choose(cross), observed.unsqueeze(-1)), factor).mT
+
+    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
+        del moves
+        white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
+        count = observed.sum(-1).to(residual.dtype)  # an integer times a float would be float32
+        return -0.5 * (white.squeeze(-1).square().sum(-1) + log_det + count * LOG_2PI)
+
+    return gain, likelihood
+
+
+def _information(
+    H: Tensor, R: Tensor, covs: Tensor, choose: Choose, observed: Tensor, added: Tensor | None
+) -> Gains:
+    r"""Return the gains K = inv(inv(P) + H' W H) H' W and the log-likelihood, W = diag(m / r).
+
+    .. math::
+        v' S^{-1} v = (v - H \delta)' W (v - H \delta) + \delta' P^{-1} \delta, \qquad
+        \log|S| = \textstyle\sum_i m_i \log r_i + \log|P| + \log|P^{-1} + H' W H|
+
+    with :math:`\delta = K v` and r plus what is added to it. Both terms of the quadratic form are
+    sums of squares, so that nothing cancels where R is small.
+    """
+    R = R if added is None else R + added
+    weight = observed / R
+    outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
+    prior_factor, prior_log_det = _factor(covs)
+    prior = choose(torch.cholesky_inverse(prior_factor))
+    factor, log_det = _factor((weight @ outer).view(prior.shape) + prior)
+    gain = torch.cholesky_solve((weight.unsqueeze(-1) * H).mT, factor)
+
+    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
+        move = torch.stack(moves, 1)
+        left = zero_missing(residual - move @ H.mT, observed)
+        by_prior = (prior @ move.unsqueeze(-1)).squeeze(-1)
+        quadratic = (weight * left.square()).sum(-1) + (move * by_prior).sum(-1)
+        log_noise = (observed * (R.log() + LOG_2PI)).sum(-1)
+        return -0.5 * (quadratic + log_noise + log_det + choose(prior_log_det))
+
+    return gain, likelihood
+
+
+def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return Cholesky factor and log-determinant; NaN for a matrix that has none, by itself."""
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    spoilt = torch.where(info == 0, 0.0, torch.nan).to(matrix.dtype)[..., None, None]
+    factor = factor + spoilt
+    return factor, 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def run_step_by_step(model: StateSpace, rows: Rows) -> Filtered:
+    """Filter by :mod:`.kalman` at every step; the covariances too have their gradient."""
+    offset, noise = model.offset(rows.action), weighted_noise(model, rows.weight)
+    means, covs, lls, mean, cov = [], [], [], rows.mean, rows.cov
+    for t in range(rows.reset.shape[1]):
+        mean, cov = rows.before(t, mean, cov)
+        predicted = predict_step(model, mean, rows.action[:, t], rows.reset[:, t], cov)
+        R = noise if rows.weight is None else noise[:, t]
+        step = (rows.observation[:, t], rows.observed[:, t], model.emission_matrix, R, offset[:, t])
+        lls.append(log_likelihood(predicted, *step))
+        belief = update(predicted, *step)
+        if model.mask_model is not None:
+            belief, ll = update_by_mask(belief, *step, model.mask_model)
+            lls[-1] = lls[-1] + ll
+        mean, cov = belief
+        means.append(mean)
+        covs.append(cov)
+    if not means:
+        nothing = mean.unsqueeze(1)[:, :0]
+        return nothing, nothing.unsqueeze(-1) * nothing.unsqueeze(-2), nothing.sum(-1)
+    return torch.stack(means, 1), torch.stack(covs, 1), torch.stack(lls, 1)
