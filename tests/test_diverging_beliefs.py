@@ -40,7 +40,7 @@ def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
 def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
     trained: TrainedAgent, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
-    point, protocol = parse("mcar:0.5", trained.settings), Protocol(3, 1, 0, 1, None)
+    point, protocol = parse("mcar:0.5", trained.settings), Protocol(3, 1, 0, 1, None, 4.0)
     expected = evaluate_condition(trained, point, ["sampled"], protocol).to_dict("records")
     step, calls, actions = BeliefFilter.step, [], []
 
@@ -87,9 +87,9 @@ def test_the_belief_of_an_episode_that_is_over_goes_no_further(
     monkeypatch.setattr(BeliefFilter, "step", look)
     point = parse("mcar:0.5", trained.settings)
     if command == "evaluate":
-        rows = evaluate_condition(trained, point, ["sampled"], Protocol(4, 1, 0, 1, None)).to_dict(
-            "records"
-        )
+        rows = evaluate_condition(
+            trained, point, ["sampled"], Protocol(4, 1, 0, 1, None, 4.0)
+        ).to_dict("records")
         lengths = [row["length"] for row in rows]
     else:
         tally = diagnose(trained, point, episodes=4, mode="sampled", seed=1, bins=[1, 2])
