@@ -88,15 +88,8 @@ def factorise(name: str, cov: Tensor) -> Tensor:
 def zero_missing(values: Tensor, observed: Tensor) -> Tensor:
     """Put 0 where nothing arrived, whatever stood there (NaN and inf included).
 
-    Uses ``torch.where``: multiplying by the mask would keep a NaN (0 * NaN = NaN), and its
-    gradient is zero at the missing entries.
-
-    Args:
-        values: shape ``(*batch, obs)``.
-        observed: bool, shape ``(*batch, obs)``, True = arrived.
-
-    Returns:
-        Tensor of the shape of ``values``.
+    Both of shape ``(*batch, obs)``. By ``torch.where``: multiplying by the mask would keep a NaN
+    (0 * NaN = NaN), and the gradient is zero at the missing entries.
 
     Example:
         >>> import torch
@@ -112,14 +105,8 @@ def masked_cov(cov: Tensor, observed: Tensor) -> Tensor:
     .. math:: A = (m m') \circ S + \mathrm{diag}(1 - m)
 
     The determinant of A and its inverse on the observed block are those of the sub-matrix
-    ``M S M'`` (eq. 10 and 12 [DRBPN]), with a static shape.
-
-    Args:
-        cov: S, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
-        observed: bool, shape ``(*batch, obs)``.
-
-    Returns:
-        A, shape ``(*batch, obs, obs)``.
+    ``M S M'`` (eq. 10 and 12 [DRBPN]), with a static shape: S is ``(*batch, obs, obs)`` or
+    ``(obs, obs)``, ``observed`` ``(*batch, obs)``, A ``(*batch, obs, obs)``.
 
     Example:
         >>> import torch
@@ -165,12 +152,6 @@ def masked_log_density(residual: Tensor, cov: Tensor, observed: Tensor) -> Tenso
 def inverse_softplus(value: Tensor) -> Tensor:
     """Return x with softplus(x) = value, for value > 0.
 
-    Args:
-        value: positive, any shape.
-
-    Returns:
-        Tensor of the same shape.
-
     Example:
         >>> import torch
         >>> x = torch.tensor([1e-4, 0.3, 50.0], dtype=torch.float64)
@@ -184,13 +165,6 @@ def positive_std(raw: Tensor, min_std: float) -> Tensor:
     """Map free numbers to standard deviations that never fall under a floor.
 
     ``std = min_std + softplus(raw)``. The floor bounds the likelihood from above.
-
-    Args:
-        raw: any shape.
-        min_std: floor, in the units of the quantity.
-
-    Returns:
-        Tensor of the same shape, every entry at least ``min_std``.
 
     Example:
         >>> import torch
@@ -232,13 +206,6 @@ def rounded_cov(cov: Tensor, dtype: torch.dtype) -> Tensor:
     Rounding errs by at most eps/2 sqrt(C_ii C_jj) in every entry. Directions measured thousands of
     times hold less variance than that beside directions never measured; raising the diagonal by
     dim * eps/2 of itself outweighs it whatever the signs.
-
-    Args:
-        cov: shape ``(*batch, dim, dim)``.
-        dtype: of the result.
-
-    Returns:
-        Shape ``(*batch, dim, dim)``.
     """
     cov = (0.5 * (cov + cov.mT)).to(dtype)
     unit = 0.5 * cov.shape[-1] * torch.finfo(dtype).eps
@@ -246,13 +213,7 @@ def rounded_cov(cov: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def tril_to_vector(cov: Tensor) -> Tensor:
-    """Flatten the lower triangle of a symmetric matrix, row by row.
-
-    Args:
-        cov: shape ``(*batch, dim, dim)``.
-
-    Returns:
-        Shape ``(*batch, dim * (dim + 1) / 2)``.
+    """Flatten the lower triangle of ``(*batch, dim, dim)``, row by row.
 
     Example:
         >>> import torch

@@ -159,16 +159,7 @@ def update(
     2013] with exercise 4.5), equal to :math:`P - K H P` in exact arithmetic and positive definite
     in float32 too. Nothing observed leaves the belief as it is.
 
-    Args:
-        belief: predicted belief, mean ``(*batch, state)``, cov ``(*batch, state, state)``.
-        observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``.
-        emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for its diagonal.
-        offset: B a + d, shape ``(*batch, obs)``; None is 0.
-
-    Returns:
-        The filtered belief.
+    Arguments are those of :func:`innovation`; it returns the filtered belief.
 
     Example:
         >>> import torch
@@ -211,16 +202,7 @@ def sequential_update(
     The result is that of :func:`update` where R is diagonal [Anderson and Moore 1979]. Nothing is
     factorised: what has no Cholesky decomposition, such as ONNX, can run it.
 
-    Args:
-        belief: predicted belief, mean ``(*batch, state)``, cov ``(*batch, state, state)``.
-        observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``.
-        emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: r, the variances ``(obs,)`` of independent noise.
-        offset: B a + d, shape ``(*batch, obs)``; None is 0.
-
-    Returns:
-        The filtered belief.
+    Arguments are those of :func:`innovation`, R diagonal; it returns the filtered belief.
 
     Example:
         >>> import torch
@@ -254,16 +236,7 @@ def log_likelihood(
 
     Eq. (12) [DRBPN]. Nothing observed: exactly 0.
 
-    Args:
-        belief: predicted belief, mean ``(*batch, state)``, cov ``(*batch, state, state)``.
-        observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``.
-        emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for its diagonal.
-        offset: B a + d, shape ``(*batch, obs)``; None is 0.
-
-    Returns:
-        Shape ``(*batch,)``, nats.
+    Arguments are those of :func:`innovation`; it returns nats, shape ``(*batch,)``.
 
     Example:
         >>> import torch

@@ -119,8 +119,7 @@ def robust_weights(
 ) -> Tensor:
     """Weigh the readings of one step, see :func:`innovation_weights`.
 
-    Arguments, result and errors are those of :func:`robust_sequence_weights`, without the dimension
-    of time.
+    Arguments, result and errors are those of :func:`robust_sequence_weights`, without time.
 
     Example:
         >>> import torch
@@ -159,21 +158,8 @@ def robust_sequence_weights(
 ) -> Tensor:
     """Weigh the readings of a sequence, step by step: each from the belief that the last one left.
 
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
-        previous_action: shape ``(*batch, time, action)``.
-        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, time, obs)``.
-        reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
-
-    Keyword Args:
-        robust: "huber" or "imq".
-        threshold: c, standard deviations.
-        cov: see :func:`filter_sequence`, as the three below.
-        use_stored_state: with ``stored_mean``.
-        stored_mean: with ``stored_cov`` where the covariance is propagated.
-        stored_cov: shape ``(*batch, time, state, state)``.
+    Arguments are those of :func:`filter_sequence`, and ``robust``, "huber" or "imq", with its
+    ``threshold`` c, standard deviations.
 
     Returns:
         Weights for :func:`filter_sequence`, shape ``(*batch, time, obs)``, without gradient.

@@ -67,20 +67,10 @@ def smooth_sequence(
     computed as :math:`(I - G F) P (I - G F)' + G (P^s + Q) G'`, equal and always positive definite.
     Nothing passes an episode start. In float64 but for the transition.
 
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before the first, shape ``(*batch, state)``.
-        cov: its covariance, shape ``(*batch, state, state)``; None: 0, so that the first predicted
-            covariance is Q. Neither is read where the first step is a reset.
-        previous_action: shape ``(*batch, time, action)``.
-        observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, time, obs)``.
-        reset: bool, shape ``(*batch, time)``; True starts from the initial belief.
-
-    Keyword Args:
-        jacobian: F, ``(state, state)``, or a function of (mean, action); None: the model's, and
-            where it has none that of the transition at the filtered mean of every row.
-        emission_cov: R of every step, shape ``(*batch, time, obs, obs)``; None: the model's.
+    Arguments are those of :func:`filter_sequence`, but for these: ``cov`` None is 0, so that the
+    first predicted covariance is Q. ``jacobian`` is F, ``(state, state)``, or a function of (mean,
+    action); None: the model's, and where it has none that of the transition at the filtered mean of
+    every row. ``emission_cov`` is R of every step, ``(*batch, time, obs, obs)``; None: the model's.
 
     Returns:
         Smoothed beliefs, shapes ``(*batch, time, ...)``; differentiable.

@@ -68,15 +68,7 @@ class TransitionMLP(NamedTuple):
         :math:`D_r^i` is the diagonal of the activation's derivatives :math:`d_i`, shape
         ``(N, width)``; of :math:`W_1` the columns of the mean count.
 
-        Args:
-            mean: shape ``(*batch, state)``.
-            action: shape ``(*batch, action)``.
-
-        Keyword Args:
-            average: whether the mean over the batch is wanted.
-
-        Returns:
-            Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
+        Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
         """
         state = mean.shape[-1]
         hidden, slopes = torch.cat([mean, action], -1), []
@@ -312,13 +304,6 @@ def propagate(jacobian: Tensor, cov: Tensor) -> Tensor:
 
     float64, symmetric, and no variance over 1e6: rows and columns that would have one are scaled
     down, which leaves a covariance with the same correlations.
-
-    Args:
-        jacobian: F, shape ``(*batch, state, state)`` or ``(state, state)``.
-        cov: shape ``(*batch, state, state)``.
-
-    Returns:
-        Shape ``(*batch, state, state)``.
 
     Example:
         >>> import torch

@@ -1,6 +1,7 @@
 """The learned state-space model, the belief filter, and its TensorDictModule."""
 
-from torchrl_drbpn.modules.belief_filter import BeliefDivergedError, BeliefFilter
+from torchrl_drbpn.modules.belief_checks import BeliefDivergedError
+from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
 from torchrl_drbpn.modules.particle_filter import ParticleFilterModule

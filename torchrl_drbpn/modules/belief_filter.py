@@ -23,8 +23,9 @@ from torchrl_drbpn.functional import (
     robust_weights,
     smooth_sequence,
 )
-from torchrl_drbpn.functional.gaussian import NotPositiveDefiniteError, without_autocast
+from torchrl_drbpn.functional.gaussian import without_autocast
 from torchrl_drbpn.functional.robust import Robust, check_robust
+from torchrl_drbpn.modules.belief_checks import checked, refuse_readings
 from torchrl_drbpn.modules.state_space import (
     CovKind,
     GaussianTransition,
@@ -36,18 +37,9 @@ from torchrl_drbpn.modules.state_space import (
     transition_functions,
 )
 
-__all__ = ["BeliefDivergedError", "BeliefFilter"]
+__all__ = ["BeliefFilter"]
 
 _MAX_DEFAULT_STATE, _MIN_INITIAL_STD = 32, 1e-3
-
-
-class BeliefDivergedError(ValueError):
-    """Report that the learned model left the range of its numbers; the input was sound.
-
-    Example:
-        >>> issubclass(BeliefDivergedError, ValueError)
-        True
-    """
 
 
 class BeliefFilter(nn.Module):
@@ -212,17 +204,9 @@ class BeliefFilter(nn.Module):
             F = functools.partial(jacobian_of, self.transition)
         mask_model = None if self.mask_model is None else MaskModel(*self.mask_model)
         return StateSpace(
-            mean,
-            cov,
-            matrix,
-            R,
-            action_matrix,
-            offset,
-            self.initial_mean,
-            initial_cov,
-            F,
+            mean, cov, matrix, R, action_matrix, offset, self.initial_mean, initial_cov, F,
             mask_model,
-        )
+        )  # fmt: skip
 
     @torch.no_grad()
     def refresh_jacobian(self, mean: Tensor, previous_action: Tensor) -> None:
@@ -296,7 +280,7 @@ class BeliefFilter(nn.Module):
                 )
             return filter_step(model, *given, cov=cov, weight=weight, return_cov=return_cov)
 
-        return self._filter_checked(run, *given[:4])
+        return checked(run, self.validate, *given[:4])
 
     # ------------------------------------------------------------------ a sequence
     def forward(
@@ -315,24 +299,8 @@ class BeliefFilter(nn.Module):
     ) -> FilterOutput:
         """Filter sequences, episode starts inside them included.
 
-        Args:
-            mean: filtered mean of the step before the first, shape ``(*batch, state)``.
-            cov: its covariance, shape ``(*batch, state, state)``; None, or not read, where it is
-                constant.
-            previous_action: shape ``(*batch, time, action)``.
-            observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
-            observed: bool, shape ``(*batch, time, obs)``, True = arrived.
-            reset: bool, shape ``(*batch, time)``, True = start from the initial belief.
-
-        Keyword Args:
-            use_stored_state: bool, shape ``(*batch, time)``; True takes the belief of the step
-                before from ``stored_mean`` (and ``stored_cov``) instead of from the sequence.
-            stored_mean: shape ``(*batch, time, state)``.
-            stored_cov: shape ``(*batch, time, state, state)``; as ``cov``.
-            return_cov: whether the filtered covariances are wanted.
-
-        Returns:
-            :class:`~torchrl_drbpn.functional.FilterOutput` with shapes ``(*batch, time, ...)``.
+        Arguments and result are those of :func:`~torchrl_drbpn.functional.filter_sequence`; ``cov``
+        may be None, and is not read, where it is constant.
 
         Raises:
             ValueError: for a shape, a dtype or an observed value that cannot be.
@@ -352,7 +320,7 @@ class BeliefFilter(nn.Module):
                 )
             return filter_sequence(model, *given, **stored, weight=weight, return_cov=return_cov)
 
-        return self._filter_checked(run, *given[:4])
+        return checked(run, self.validate, *given[:4])
 
     def predict(
         self, mean: Tensor, previous_action: Tensor, reset: Tensor, cov: Tensor | None = None
@@ -372,11 +340,7 @@ class BeliefFilter(nn.Module):
         reset: Tensor,
         **options: Any,
     ) -> Belief:
-        """Return the beliefs given the whole sequence.
-
-        Arguments as of :meth:`forward`, options as of
-        :func:`~torchrl_drbpn.functional.smooth_sequence`.
-        """
+        """Return the beliefs given the whole sequence, see :func:`functional.smooth_sequence`."""
         if self.validate:
             refuse_readings(observation, observed)
         cov = cov if self.covariance == "propagated" else None
@@ -387,75 +351,6 @@ class BeliefFilter(nn.Module):
     def forecast(
         self, mean: Tensor, cov: Tensor | None, action: Tensor, **options: Any
     ) -> Forecast:
-        """Predict the steps ahead; see :func:`~torchrl_drbpn.functional.forecast`."""
+        """Predict the steps ahead, see :func:`functional.forecast`."""
         cov = cov if self.covariance == "propagated" else None
         return forecast(self.state_space(), mean, cov, action, **options)
-
-    # ------------------------------------------------------------------ checks
-    def _filter_checked(
-        self,
-        run: Callable[[], FilterOutput],
-        mean: Tensor,
-        previous_action: Tensor,
-        observation: Tensor,
-        observed: Tensor,
-    ) -> FilterOutput:
-        """Filter, and raise if the result is not finite: name the input that caused it.
-
-        One sum tells. The mean is in it: where nothing was observed the likelihood is 0.
-        """
-        silent = not self.validate or torch.compiler.is_compiling() or observation.is_meta
-        failed: NotPositiveDefiniteError | None = None
-        try:
-            out = run()
-        except NotPositiveDefiniteError as error:  # a covariance network of NaN gives no covariance
-            if silent:
-                raise
-            failed = error
-        else:
-            if silent:
-                return out
-            total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
-            try:
-                if bool(total.isfinite()):
-                    return out
-            except RuntimeError:  # under vmap no number reaches the host
-                return out
-        refuse_readings(observation, observed)
-        for name, value in (("previous_action", previous_action), ("mean", mean)):
-            if not bool(torch.isfinite(value).all()):
-                raise ValueError(
-                    f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "
-                    "by a policy or a filter that had diverged?"
-                )
-        if failed is not None:
-            raise failed
-        raise BeliefDivergedError(
-            "the belief is no longer finite although every observed entry is: the learned model "
-            "diverged. Lower the learning rate, or use residual=False where state > obs."
-        )
-
-
-def refuse_readings(observation: Tensor, observed: Tensor) -> None:
-    """Raise ValueError naming the components whose readings that arrived are no usable numbers."""
-    largest = torch.finfo(observation.dtype).max ** 0.5
-    for bad, what, remedy in (
-        (observation.isnan(), "NaN", "mark them missing, for example with ObservedFromNaN"),
-        (
-            observation.isinf(),
-            "infinite readings",
-            "a sensor or a division has overflowed; set `observed` to False there "
-            "(ObservedFromNaN marks NaN alone)",
-        ),
-        (
-            observation.abs() > largest,
-            f"readings over {largest:.1e}, whose squares overflow",
-            "standardise them with MaskedObservationNorm, which clips, or mark them missing",
-        ),
-    ):
-        at = (bad & observed).reshape(-1, observation.shape[-1]).any(0).nonzero().flatten().tolist()
-        if at:
-            raise ValueError(
-                f"`observation` holds {what} in entries that `observed` calls arrived "
-                f"(components {at}): {remedy}."
-            )

@@ -20,7 +20,7 @@ from torchrl_drbpn.functional import (
     zero_missing,
 )
 from torchrl_drbpn.functional.gaussian import check_observed
-from torchrl_drbpn.modules.belief_filter import BeliefDivergedError, refuse_readings
+from torchrl_drbpn.modules.belief_checks import BeliefDivergedError, refuse_readings
 from torchrl_drbpn.modules.state_space import check_dim
 
 __all__ = ["ParticleFilter"]

@@ -202,18 +202,7 @@ class GaussianTransition(nn.Module):
         return self.noise is not None
 
     def cov(self, mean: Tensor | None = None, action: Tensor | None = None) -> Tensor:
-        """Return Q.
-
-        Args:
-            mean: shape ``(*batch, state)``; needed where Q is a network.
-            action: shape ``(*batch, action)``; needed where Q is a network.
-
-        Returns:
-            ``(state, state)`` for a constant Q, else ``(*batch, state, state)``.
-
-        Raises:
-            ValueError: if Q is a network and mean or action is missing.
-        """
+        """Return Q; where it is a network, of both arguments, ``(*batch, state, state)``."""
         if self.noise is not None:
             return self.noise()
         if mean is None or action is None or self.cov_layers is None:
@@ -225,15 +214,7 @@ class GaussianTransition(nn.Module):
         return torch.diag_embed(cov) if self.cov_kind == "diag" else cov
 
     def forward(self, mean: Tensor, action: Tensor) -> Belief:
-        """Return the predicted belief.
-
-        Args:
-            mean: filtered mean of the step before, shape ``(*batch, state)``.
-            action: previous action, shape ``(*batch, action)``.
-
-        Returns:
-            ``Belief(mean, cov)`` of shapes ``(*batch, state)``, ``(*batch, state, state)``.
-        """
+        """Return the predicted belief, of ``(*batch, state)`` and ``(*batch, action)``."""
         predicted = self.mean_network()(mean, action)
         cov = self.cov(mean, action)
         return Belief(predicted, cov.expand(*predicted.shape, self.state_dim))
@@ -244,15 +225,8 @@ def jacobian_of(
 ) -> Tensor:
     """Return the derivative of a transition's mean by the mean, of each row or averaged over all.
 
-    Args:
-        transition: as in :func:`transition_functions`; in closed form for a GaussianTransition
-            whose ``forward`` is its own, by torch.func for another.
-        mean: shape ``(*batch, state)``.
-        action: shape ``(*batch, action)``.
-        average: whether the mean over the batch is wanted.
-
-    Returns:
-        Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
+    In closed form for a GaussianTransition whose ``forward`` is its own, by torch.func for another.
+    Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
     """
     f, state = transition_functions(transition)[0], mean.shape[-1]
     if isinstance(f, TransitionMLP):
@@ -266,9 +240,7 @@ def transition_functions(
 ) -> tuple[TransitionMLP | Function, Tensor | Function]:
     """Return f and Q of a transition as :class:`~torchrl_drbpn.functional.StateSpace` takes them.
 
-    Args:
-        transition: returns (mean, cov) of (mean, action). A :class:`GaussianTransition` is taken
-            apart unless a subclass has a ``forward`` of its own, which counts.
+    A :class:`GaussianTransition` is taken apart unless a subclass has a ``forward`` of its own.
     """
     if (
         not isinstance(transition, GaussianTransition)
@@ -342,10 +314,8 @@ class LinearGaussianEmission(nn.Module):
             self.register_buffer("matrix", matrix)
         else:
             self.matrix = nn.Parameter(matrix)
-        self.action_matrix = nn.Parameter(
-            torch.zeros(obs_dim, action_dim, device=device, dtype=dtype)
-        )
-        self.offset = nn.Parameter(torch.zeros(obs_dim, device=device, dtype=dtype))
+        self.action_matrix = nn.Parameter(matrix.new_zeros(obs_dim, action_dim))
+        self.offset = nn.Parameter(matrix.new_zeros(obs_dim))
         self.noise = LearnedCovariance(obs_dim, cov, init_std, min_std, device, dtype)
 
     def reset_parameters(self) -> None:
@@ -376,14 +346,6 @@ class LinearGaussianEmission(nn.Module):
         return self.noise.compact()
 
     def forward(self, state: Tensor, previous_action: Tensor) -> Tensor:
-        """Return the expected observation.
-
-        Args:
-            state: shape ``(*batch, state)``.
-            previous_action: shape ``(*batch, action)``.
-
-        Returns:
-            Shape ``(*batch, obs)``, observation units.
-        """
+        """Return the expected observation, of ``(*batch, state)`` and ``(*batch, action)``."""
         offset = nn.functional.linear(previous_action, self.action_matrix, self.offset)
         return state @ self.matrix.mT + offset

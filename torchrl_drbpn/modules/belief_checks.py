@@ -1,0 +1,91 @@
+"""Tell readings that are no numbers from a model that has diverged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchrl_drbpn.functional import FilterOutput
+from torchrl_drbpn.functional.gaussian import NotPositiveDefiniteError
+
+__all__ = ["BeliefDivergedError"]
+
+
+class BeliefDivergedError(ValueError):
+    """Report that the learned model left the range of its numbers; the input was sound.
+
+    Example:
+        >>> issubclass(BeliefDivergedError, ValueError)
+        True
+    """
+
+
+def checked(
+    run: Callable[[], FilterOutput],
+    validate: bool,
+    mean: Tensor,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+) -> FilterOutput:
+    """Filter, and raise if the result is not finite: name the input that caused it.
+
+    One sum tells. The mean is in it: where nothing was observed the likelihood is 0.
+    """
+    silent = not validate or torch.compiler.is_compiling() or observation.is_meta
+    failed: NotPositiveDefiniteError | None = None
+    try:
+        out = run()
+    except NotPositiveDefiniteError as error:  # a covariance network of NaN gives no covariance
+        if silent:
+            raise
+        failed = error
+    else:
+        if silent:
+            return out
+        total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
+        try:
+            if bool(total.isfinite()):
+                return out
+        except RuntimeError:  # under vmap no number reaches the host
+            return out
+    refuse_readings(observation, observed)
+    for name, value in (("previous_action", previous_action), ("mean", mean)):
+        if not bool(torch.isfinite(value).all()):
+            raise ValueError(
+                f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "
+                "by a policy or a filter that had diverged?"
+            )
+    if failed is not None:
+        raise failed
+    raise BeliefDivergedError(
+        "the belief is no longer finite although every observed entry is: the learned model "
+        "diverged. Lower the learning rate, or use residual=False where state > obs."
+    )
+
+
+def refuse_readings(observation: Tensor, observed: Tensor) -> None:
+    """Raise ValueError naming the components whose readings that arrived are no usable numbers."""
+    largest = torch.finfo(observation.dtype).max ** 0.5
+    for bad, what, remedy in (
+        (observation.isnan(), "NaN", "mark them missing, for example with ObservedFromNaN"),
+        (
+            observation.isinf(),
+            "infinite readings",
+            "a sensor or a division has overflowed; set `observed` to False there "
+            "(ObservedFromNaN marks NaN alone)",
+        ),
+        (
+            observation.abs() > largest,
+            f"readings over {largest:.1e}, whose squares overflow",
+            "standardise them with MaskedObservationNorm, which clips, or mark them missing",
+        ),
+    ):
+        at = (bad & observed).reshape(-1, observation.shape[-1]).any(0).nonzero().flatten().tolist()
+        if at:
+            raise ValueError(
+                f"`observation` holds {what} in entries that `observed` calls arrived "
+                f"(components {at}): {remedy}."
+            )
