@@ -53,8 +53,7 @@ def run(config: dict[str, Any]) -> int:
     """Export the agent of a run; see conf/export.yaml."""
     kind, out = _check(config)
     torch.set_num_threads(config["threads"])
-    robust = "none" if config["robust"] is False else config["robust"]
-    trained = load_trained_agent(Path(config["run"]), robust, config["robust_threshold"])
+    trained = load_trained_agent(Path(config["run"]), config["robust"], config["robust_threshold"])
     policy, robots = trained.agent.policy, config["robots"]
     data, actions = record(trained, robots, config["steps"], config["seed"])
     step = policy_step(trained, actions, sequential=kind == "onnx")

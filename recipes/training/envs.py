@@ -8,7 +8,9 @@ from typing import Any
 import gymnasium
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.collectors import Collector
+from torchrl.data import Bounded
 from torchrl.envs import (
     CatTensors,
     Compose,
@@ -72,7 +74,16 @@ def make_env(
         for part in node if isinstance(node, ListConfig) else [] if node is None else [node]:
             part = part if isinstance(part, Transform) else build(own, part)
             made += part if isinstance(part, list) else [part]
-    env = TransformedEnv(base, Compose(*made))
+    env = base if isinstance(base, TransformedEnv) else TransformedEnv(base, Compose())
+    for transform in made:
+        written = env.observation_spec.keys(True, True)
+        if isinstance(transform, RenameTransform) and {*transform.in_keys} - {*written}:
+            raise UserError(
+                f"`transforms`: {', '.join(transform.in_keys)} is to be read, and the environment "
+                f"writes {', '.join(map(str, written))}: give the entry's name, such as "
+                "'transforms.sensors.in_keys=[mask]'."
+            )
+        env.append_transform(transform)
     seed_env(env, config.seed if seed is None else seed)
     return env
 
@@ -122,12 +133,18 @@ def make_torchrl_env(
         if not base.batch_size:
             base.close()
             base = (ParallelEnv if parallel else SerialEnv)(num_envs, make)
-    except (ValueError, ImportError, RuntimeError) as error:
+    except (ValueError, ImportError, RuntimeError, gymnasium.error.Error) as error:
         raise UserError(f"`env.make`: {one_line(error)}") from error
     if base.batch_size != (num_envs,):
         raise UserError(
             f"`env.make` gives a batch of {tuple(base.batch_size)} environments: set "
             f"collector.num_envs={base.batch_size.numel()}, got {num_envs}."
+        )
+    action = base.action_spec
+    if not isinstance(action, Bounded) or not action.dtype.is_floating_point or action.ndim != 2:
+        raise UserError(
+            f"`env.make` must give an environment whose action is a vector of bounded real "
+            f"numbers, got {type(action).__name__} of {action.dtype}, shape {tuple(action.shape)}."
         )
     known = [key for key in base.observation_spec.keys(True, True) if isinstance(key, str)]
     if unknown := [key for key in observation_keys if key not in known]:
@@ -135,10 +152,24 @@ def make_torchrl_env(
             f"`env.observation_keys` must hold entries of the observation, {', '.join(known)}; "
             f"got {', '.join(unknown)}."
         )
-    parts: list[Transform] = [DoubleToFloat()]
+    parts: list[Transform] = [_ClippedAction(action.space.low, action.space.high), DoubleToFloat()]
     if [*observation_keys] != ["observation"]:
         parts.append(CatTensors([*observation_keys], "observation"))
     return TransformedEnv(base, Compose(*parts))
+
+
+class _ClippedAction(Transform):
+    """Keep sampled actions within their limits, as our own simulators do; the stored one stays.
+
+    TorchRL's ClipTransform takes one number for all components.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        self.limits = low, high
+
+    def _inv_apply_transform(self, action: Tensor) -> Tensor:
+        return action.clamp(*self.limits)
 
 
 def env_name(config: DictConfig) -> str:
