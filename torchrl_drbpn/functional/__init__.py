@@ -23,13 +23,14 @@ from torchrl_drbpn.functional.gaussian import (
     tril_to_vector,
     zero_missing,
 )
-from torchrl_drbpn.functional.informative import MaskModel, update_by_mask
 from torchrl_drbpn.functional.kalman import (
+    MaskModel,
     innovation,
     log_likelihood,
     predict,
     sequential_update,
     update,
+    update_by_mask,
 )
 from torchrl_drbpn.functional.missingness import (
     MissingnessMechanism,

@@ -21,8 +21,7 @@ from torchrl_drbpn.functional.gaussian import (
     rounded_cov,
     zero_missing,
 )
-from torchrl_drbpn.functional.informative import update_by_mask
-from torchrl_drbpn.functional.kalman import log_likelihood, update
+from torchrl_drbpn.functional.kalman import log_likelihood, update, update_by_mask
 from torchrl_drbpn.functional.state_space import StateSpace, predict_step, propagate
 
 __all__ = ["Rows", "run_in_pytorch", "run_step_by_step", "weighted_noise"]

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix, factorise, without_autocast
-from torchrl_drbpn.functional.informative import update_by_mask
-from torchrl_drbpn.functional.kalman import predict, update
+from torchrl_drbpn.functional.kalman import predict, update, update_by_mask
 from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
 
 __all__ = ["Forecast", "Jacobian", "forecast", "row_jacobian", "smooth_sequence"]

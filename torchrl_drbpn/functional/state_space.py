@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix
-from torchrl_drbpn.functional.informative import MaskModel
+from torchrl_drbpn.functional.kalman import MaskModel
 
 __all__ = ["StateSpace", "TransitionMLP", "predict_step", "propagate"]
 
