@@ -181,7 +181,7 @@ def test_a_float32_step_has_the_digits_of_the_float32_module(obs, state, cov):
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize("kind", ["innovation", "information", "network"])
+@pytest.mark.parametrize("kind", ["innovation", "information", "network", "propagated", "row"])
 @pytest.mark.parametrize("batch", [(), (2, 3)])
 def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
     belief, head = make(kind)
@@ -189,7 +189,7 @@ def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
     rows = [x.expand(2, *x.shape).flatten(0, 1) for x in first_step(belief)]  # six
     rows[3], rows[4] = torch.zeros_like(rows[3]), torch.randn_like(rows[4])
     rows = [x[: torch.Size(batch).numel()] for x in rows]
-    action, mean = step(*(x.reshape(*batch, x.shape[-1]) for x in rows))[:2]
+    action, mean = step(*(x.reshape(*batch, *x.shape[1:]) for x in rows))[:2]
     expected = step(*rows)
     torch.testing.assert_close(action.reshape(-1, ACTION), expected[0])
     torch.testing.assert_close(mean.reshape(expected[1].shape), expected[1])

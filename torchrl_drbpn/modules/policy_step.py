@@ -196,7 +196,10 @@ class PolicyStep(nn.Module):
         if cov is not None and self.propagated:
             row = filter.jacobian == "row"
             F = jacobian_of(filter.transition, mean, previous_action) if row else None
-            P = propagate(filter.mean_jacobian if F is None else F, cov.masked_fill(first, 0.0)) + Q
+            moved_cov = propagate(
+                filter.mean_jacobian if F is None else F, cov.masked_fill(first, 0.0)
+            )
+            P = moved_cov.to(H.dtype) + Q
         m = torch.where(is_init, filter.initial_mean, moved)
         wants_cov, filtered_cov = self.propagated or self.policy_input == "mean_cov", None
         # A product and a sum, not a matmul: Inductor fuses it with what surrounds it.
