@@ -190,3 +190,13 @@ def test_the_module_learns_it_by_the_model_loss_and_steps_are_the_sequence(covar
         )  # fmt: skip
     belief_filter.reset_parameters()
     assert not belief_filter.mask_model.any()
+
+
+def test_a_robust_update_beside_a_mask_model_is_refused():
+    """Its weights would be those of another belief in a sequence than one step at a time."""
+    with pytest.raises(ValueError, match="`robust` must be None with a `mask_model`"):
+        BeliefFilter(3, 2, mask_model=True, robust="huber")
+    belief_filter, x = BeliefFilter(3, 2, mask_model=True), torch.zeros(4, 3)
+    belief_filter.robust = "imq"
+    with pytest.raises(ValueError, match="`robust` must be None with a `mask_model`"):
+        belief_filter.step(x, None, torch.zeros(4, 2), x, x == 0, torch.zeros(4, dtype=torch.bool))

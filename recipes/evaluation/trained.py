@@ -137,7 +137,7 @@ def load_trained_agent(
         )
     update: Any = None if robust == "none" else robust
     try:
-        check_robust(update, threshold)
+        check_robust(update, threshold, agent.belief.filter.mask_model)
     except ValueError as error:
         raise UserError(str(error)) from error
     agent.belief.filter.robust, agent.belief.filter.robust_threshold = update, threshold

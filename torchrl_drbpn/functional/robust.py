@@ -166,7 +166,7 @@ def robust_sequence_weights(
 
     Raises:
         ValueError: for a wrong shape or dtype, another ``robust``, a ``threshold`` that is not
-            positive and finite.
+            positive and finite, a model with a ``mask_model``.
 
     Example:
         >>> import torch
@@ -181,7 +181,7 @@ def robust_sequence_weights(
         >>> torch.equal(w, torch.ones_like(x))
         True
     """
-    check_robust(robust, threshold)
+    check_robust(robust, threshold, model.mask_model)
     steps = tuple(reset.shape)
     model.check_inputs(
         steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
@@ -214,12 +214,16 @@ def robust_sequence_weights(
     return torch.stack(weights, -2) if weights else torch.ones_like(observation)
 
 
-def check_robust(robust: Any, threshold: Any) -> None:
+def check_robust(robust: Any, threshold: Any, mask_model: Any) -> None:
     """Raise unless the update is one of those there are, its threshold a positive number."""
     if robust is not None and robust not in get_args(Robust):
         raise ValueError(
             f"`robust` must be one of {', '.join(get_args(Robust))}, or None to believe every "
             f"reading, got {robust!r}."
+        )
+    if robust is not None and mask_model is not None:
+        raise ValueError(
+            "`robust` must be None with a `mask_model`: weights are of readings that arrived alone."
         )
     number = isinstance(threshold, (int, float)) and not isinstance(threshold, bool)
     if not number or not 0 < threshold < math.inf:

@@ -74,7 +74,8 @@ class BeliefFilter(nn.Module):
             belief, step by step.
         robust: "huber" or "imq" gives a reading that contradicts the prediction and the other
             readings a weight under 1 (:func:`~torchrl_drbpn.functional.innovation_weights`), in
-            acting and in training alike; None believes every reading. May be set later.
+            acting and in training alike; None, as a ``mask_model`` needs it, believes every
+            reading. May be set later.
         robust_threshold: standard deviations off at which the weights begin to fall.
         mask_model: whether to learn :class:`~torchrl_drbpn.functional.MaskModel` too: entries are
             missing for a reason. The likelihood is then that of readings and mask, the belief
@@ -149,7 +150,6 @@ class BeliefFilter(nn.Module):
                         f"`{part}` has {name}={its}, the filter {name}={mine}: build both with "
                         "the same dimensions."
                     )
-        check_robust(robust, robust_threshold)
         self.covariance, self.jacobian, self.validate = covariance, jacobian, validate
         self.robust, self.robust_threshold = robust, robust_threshold
         if covariance == "propagated":
@@ -163,6 +163,7 @@ class BeliefFilter(nn.Module):
         self.mask_model: nn.Parameter | None = None
         if mask_model:  # intercepts, slopes
             self.mask_model = nn.Parameter(torch.zeros(2, obs_dim, **place))
+        check_robust(robust, robust_threshold, self.mask_model)
         self._check_model()
         self._fresh = covariance == "propagated"
 
