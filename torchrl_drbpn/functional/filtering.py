@@ -21,12 +21,11 @@ from torchrl_drbpn.functional import native
 from torchrl_drbpn.functional.gaussian import Belief, without_autocast
 from torchrl_drbpn.functional.kalman import update
 from torchrl_drbpn.functional.pytorch_form import (
-    Rows,
     run_in_pytorch,
     run_step_by_step,
     weighted_noise,
 )
-from torchrl_drbpn.functional.state_space import StateSpace, propagate
+from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, propagate
 
 __all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
 
@@ -84,18 +83,17 @@ def filter_step(
         >>> bool((out.mean == 1).all()), bool((out.log_likelihood == 0).all())
         (True, True)
     """
-    steps = tuple(reset.shape)
-    model.check_inputs(
-        steps, steps, mean, previous_action, observation, observed, reset, cov=cov, weight=weight
+    given = FilterInputs(
+        observation, observed, previous_action, reset, None, None, mean, None, cov, weight
     )
-    observation, observed, previous_action = (
-        x.unsqueeze(-2) for x in (observation, observed, previous_action)
+    model.check_inputs(given, reset.shape)
+    given = given._replace(
+        observation=observation.unsqueeze(-2),
+        observed=observed.unsqueeze(-2),
+        previous_action=previous_action.unsqueeze(-2),
+        reset=reset.unsqueeze(-1),
+        weight=None if weight is None else weight.unsqueeze(-2),
     )
-    weight = None if weight is None else weight.unsqueeze(-2)
-    given = Rows(
-        observation, observed, previous_action, reset.unsqueeze(-1), None, None, mean, None, cov,
-        weight,
-    )  # fmt: skip
     out = _filter(model, given, return_cov, form)
     filtered = None if out.cov is None else out.cov.squeeze(-3)
     return FilterOutput(out.mean.squeeze(-2), filtered, out.log_likelihood.squeeze(-1))
@@ -167,19 +165,15 @@ def filter_sequence(
             "`use_stored_state` and `stored_mean` come together: the one says where, the other "
             "from which belief."
         )
-    steps = tuple(reset.shape)
-    model.check_inputs(
-        steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
-        stored_mean, stored_cov, cov, weight,
-    )  # fmt: skip
-    given = Rows(
+    given = FilterInputs(
         observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
         stored_cov, cov, weight,
     )  # fmt: skip
+    model.check_inputs(given, reset.shape[:-1])
     return _filter(model, given, return_cov, form)
 
 
-def _filter(model: StateSpace, given: Rows, return_cov: bool, form: Form) -> FilterOutput:
+def _filter(model: StateSpace, given: FilterInputs, return_cov: bool, form: Form) -> FilterOutput:
     """Choose the form, and filter checked inputs as rows."""
     if form not in ("auto", "pytorch", "native"):
         raise ValueError(f"`form` must be 'auto', 'pytorch' or 'native', got {form!r}.")
@@ -196,12 +190,13 @@ def _filter(model: StateSpace, given: Rows, return_cov: bool, form: Form) -> Fil
         given = given._replace(observed=observed, weight=weight)
     *batch, time = given.reset.shape
     # Not -1: there may be no step at all.
-    rows = Rows(*(
+    rows = FilterInputs(*(
         None if x is None else x.reshape(math.prod(batch), *x.shape[len(batch) :]) for x in given
     ))  # type: ignore[arg-type]  # fmt: skip
     reason: str | None = "PyTorch was asked for"
     if form != "pytorch":
-        reason = native.unsupported_reason(model, given.observation, given.action, *given[5:9])
+        floats = given.observation, given.previous_action, *given[5:9]
+        reason = native.unsupported_reason(model, *floats)
         reason = "it takes no weights" if reason is None and weight is not None else reason
         if reason is not None and form == "native":
             raise ValueError(f"`form` 'native' cannot run here: {reason}. Use form='auto'.")
@@ -267,11 +262,11 @@ def filtered_cov(
             "filter_sequence or filter_step for it."
         )
     nothing = observed.new_zeros((), dtype=model.initial_mean.dtype)  # only the masks are read
-    rows = Rows(nothing, observed, nothing, reset, None, None, nothing, weight=weight)
+    rows = FilterInputs(nothing, observed, nothing, reset, None, None, nothing, weight=weight)
     return _filtered_cov(model, rows, None)
 
 
-def _filtered_cov(model: StateSpace, rows: Rows, filtered: Tensor | None) -> Tensor:
+def _filtered_cov(model: StateSpace, rows: FilterInputs, filtered: Tensor | None) -> Tensor:
     """Return covariances with the gradient of one step: a propagated one before is a constant."""
     first, F, P = rows.reset[..., None, None], model.transition_jacobian, model.constant_cov()
     if filtered is not None and rows.cov is not None and isinstance(F, Tensor):

@@ -14,14 +14,14 @@ import itertools
 from collections.abc import Sequence
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from torchrl_drbpn.functional.pytorch_form import Filtered, Rows, run_in_pytorch
-from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
+from torchrl_drbpn.functional.pytorch_form import Filtered, run_in_pytorch
+from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, TransitionMLP
 
 __all__ = ["filter_rows", "native_status", "operator_arguments", "unsupported_reason"]
 
@@ -115,7 +115,7 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
     return native_status()
 
 
-def filter_rows(model: StateSpace, rows: Rows) -> Filtered:
+def filter_rows(model: StateSpace, rows: FilterInputs) -> Filtered:
     """Filter what :func:`unsupported_reason` has nothing against, as ``run_in_pytorch`` does."""
     mean, ll, _, cov = torch.ops.torchrl_drbpn.filter_rows(*rows[:9], *operator_arguments(model))
     return mean, None if model.transition_jacobian is None else cov, ll
@@ -128,8 +128,7 @@ def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
     on lists of tensors), F or None, the widths of its layers, whether it is residual, and whether
     it has tanh.
     """
-    f = model.transition
-    assert isinstance(f, TransitionMLP)  # the rule saw to it; for the type checker
+    f = cast(TransitionMLP, model.transition)  # the rule saw to it
     layers = itertools.chain.from_iterable(zip(f.weights, f.biases, strict=True))
     return (
         model.constant_cov(), model.full_initial_cov(), model.emission_cov, model.emission_matrix,
@@ -329,7 +328,7 @@ class _Filter(torch.autograd.Function):
             return (*sequence, None, None, Q, P0, R, H, B, d, m0, network, *(None,) * 4)
         Q, P0, R, H, B, d, m0, network, F = saved[9:]
         model = StateSpace(_unpacked(network, Q, B, *ctx.rest), Q, H, R, B, d, m0, P0, F)
-        outputs = run_in_pytorch(model, Rows(*saved[:9]))[::2]
+        outputs = run_in_pytorch(model, FilterInputs(*saved[:9]))[::2]
         pairs = [(o, g) for o, g in zip(outputs, by_outputs[:2], strict=True) if g is not None]
         values, weights = zip(*pairs, strict=True)
         wanted = [x for x in saved if x is not None and x.requires_grad]

@@ -10,7 +10,6 @@ digits of a gain.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,39 +21,20 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import log_likelihood, update, update_by_mask
-from torchrl_drbpn.functional.state_space import StateSpace, predict_step, propagate
+from torchrl_drbpn.functional.state_space import (
+    FilterInputs,
+    StateSpace,
+    predict_step,
+    propagate,
+)
 
-__all__ = ["Rows", "run_in_pytorch", "run_step_by_step", "weighted_noise"]
+__all__ = ["run_in_pytorch", "run_step_by_step", "weighted_noise"]
 
 # Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step; leaves alone
 # what is there for every step.
 Choose = Callable[[Tensor], Tensor]
 Gains = tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]
 Filtered = tuple[Tensor, Tensor | None, Tensor]  # means, covariances, log-likelihoods
-
-
-class Rows(NamedTuple):
-    """Checked arguments of :func:`filter_sequence`, all batch dimensions as one."""
-
-    observation: Tensor
-    observed: Tensor
-    action: Tensor
-    reset: Tensor
-    use_stored_state: Tensor | None
-    stored_mean: Tensor | None
-    mean: Tensor
-    stored_cov: Tensor | None = None
-    cov: Tensor | None = None
-    weight: Tensor | None = None
-
-    def before(self, t: int, mean: Tensor, cov: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Return the belief that step t starts from: the one before, or what is stored."""
-        if self.use_stored_state is None or self.stored_mean is None:
-            return mean, cov
-        use = self.use_stored_state[:, t, None]
-        if cov is not None and self.stored_cov is not None:
-            cov = torch.where(use.unsqueeze(-1), self.stored_cov[:, t], cov)
-        return torch.where(use, self.stored_mean[:, t], mean), cov
 
 
 def _added_noise(R: Tensor, weight: Tensor) -> Tensor:
@@ -70,13 +50,13 @@ def weighted_noise(model: StateSpace, weight: Tensor | None) -> Tensor:
     return model.full_emission_cov() + torch.diag_embed(_added_noise(R, weight))
 
 
-def run_in_pytorch(model: StateSpace, rows: Rows) -> Filtered:
+def run_in_pytorch(model: StateSpace, rows: FilterInputs) -> Filtered:
     """Filter where predicted covariances do not depend on the mean.
 
     Returns:
         Means, covariances (without gradient) where they are propagated, log-likelihoods.
     """
-    observed, reset, mean = rows.observed, rows.reset, rows.mean
+    observed, reset, action, mean = rows.observed, rows.reset, rows.previous_action, rows.mean
     H, R, dtype = model.emission_matrix.double(), model.emission_cov.double(), mean.dtype
     added = None if rows.weight is None else _added_noise(R, rows.weight)
     covs = torch.stack([model.full_initial_cov(), model.constant_cov()]).double()
@@ -86,8 +66,8 @@ def run_in_pytorch(model: StateSpace, rows: Rows) -> Filtered:
         return torch.where(first, pair[0], pair[1])
 
     filtered_covs = None
-    if model.transition_jacobian is not None:
-        covs, filtered_covs = _run_covariances(model, rows, choose(covs), added)
+    if isinstance(F := model.transition_jacobian, Tensor) and rows.cov is not None:
+        covs, filtered_covs = _run_covariances(model, rows, F, rows.cov, choose(covs), added)
         filtered_covs = rounded_cov(filtered_covs, dtype)
 
         def choose(pair: Tensor) -> Tensor:
@@ -96,9 +76,9 @@ def run_in_pytorch(model: StateSpace, rows: Rows) -> Filtered:
     gains = _information if model.information_form else _innovation
     gain, likelihood = gains(H, R, covs, choose, observed, added)
     # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
-    y = zero_missing(rows.observation, observed).double() - model.offset(rows.action).double()
+    y = zero_missing(rows.observation, observed).double() - model.offset(action).double()
     innovations, moves, filtered, H_t = [], [], [], H.mT
-    steps = zip(*(x.unbind(1) for x in (y, gain, rows.action, reset.unsqueeze(-1))), strict=True)
+    steps = zip(*(x.unbind(1) for x in (y, gain, action, reset.unsqueeze(-1))), strict=True)
     for t, (y_t, gain_t, action_t, reset_t) in enumerate(steps):
         mean, _ = rows.before(t, mean, None)
         m = model.predicted_mean(mean, action_t, reset_t).double()
@@ -116,7 +96,12 @@ def run_in_pytorch(model: StateSpace, rows: Rows) -> Filtered:
 
 
 def _run_covariances(
-    model: StateSpace, rows: Rows, own: Tensor, added: Tensor | None
+    model: StateSpace,
+    rows: FilterInputs,
+    F: Tensor,
+    cov: Tensor,
+    own: Tensor,
+    added: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Propagate and update covariances ahead of the means; ``own`` is Q or P_0 of each step.
 
@@ -124,8 +109,7 @@ def _run_covariances(
         The predicted ones, with the gradient by ``own`` alone, and the filtered ones, without;
         float64, ``(batch, time, state, state)``.
     """
-    F, cov, given, observed = model.transition_jacobian, rows.cov, rows.reset, rows.observed
-    assert isinstance(F, Tensor) and cov is not None  # noqa: PT018  for the type checker
+    given, observed = rows.reset, rows.observed
     H, R = model.emission_matrix.detach().double(), model.emission_cov.detach().double()
     if not model.information_form:
         R = model.full_emission_cov().detach().double()
@@ -223,13 +207,13 @@ def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return factor, 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def run_step_by_step(model: StateSpace, rows: Rows) -> Filtered:
+def run_step_by_step(model: StateSpace, rows: FilterInputs) -> Filtered:
     """Filter by :mod:`.kalman` at every step; the covariances too have their gradient."""
-    offset, noise = model.offset(rows.action), weighted_noise(model, rows.weight)
+    offset, noise = model.offset(rows.previous_action), weighted_noise(model, rows.weight)
     means, covs, lls, mean, cov = [], [], [], rows.mean, rows.cov
     for t in range(rows.reset.shape[1]):
         mean, cov = rows.before(t, mean, cov)
-        predicted = predict_step(model, mean, rows.action[:, t], rows.reset[:, t], cov)
+        predicted = predict_step(model, mean, rows.previous_action[:, t], rows.reset[:, t], cov)
         R = noise if rows.weight is None else noise[:, t]
         step = (rows.observation[:, t], rows.observed[:, t], model.emission_matrix, R, offset[:, t])
         lls.append(log_likelihood(predicted, *step))

@@ -14,7 +14,7 @@ from torchrl_drbpn.functional.gaussian import (
     without_autocast,
     zero_missing,
 )
-from torchrl_drbpn.functional.state_space import StateSpace, predict_step
+from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, predict_step
 
 __all__ = [
     "Robust",
@@ -182,29 +182,25 @@ def robust_sequence_weights(
         True
     """
     check_robust(robust, threshold, model.mask_model)
-    steps = tuple(reset.shape)
-    model.check_inputs(
-        steps, steps[:-1], mean, previous_action, observation, observed, reset, use_stored_state,
-        stored_mean, stored_cov, cov,
+    given = FilterInputs(
+        observation, observed, previous_action, reset, use_stored_state, stored_mean, mean,
+        stored_cov, cov,
     )  # fmt: skip
+    model.check_inputs(given, reset.shape[:-1])
     with without_autocast(mean):
         H, R = model.emission_matrix.double(), model.full_emission_cov().double()
         noise, offset = R.diagonal(), model.offset(previous_action).double()
         filled = zero_missing(observation, observed).double()
         cov, weights = None if model.transition_jacobian is None else cov, []
-        for t in range(steps[-1]):
-            if use_stored_state is not None and stored_mean is not None:
-                use = use_stored_state[..., t, None]
-                mean = torch.where(use, stored_mean[..., t, :], mean)
-                if stored_cov is not None and cov is not None:
-                    cov = torch.where(use.unsqueeze(-1), stored_cov[..., t, :, :], cov)
+        for t in range(reset.shape[-1]):
+            mean, cov = given.before(t, mean, cov)
             action, seen = previous_action[..., t, :], observed[..., t, :]
             m, P = (x.double() for x in predict_step(model, mean, action, reset[..., t], cov))
             cross = H @ P
             S = cross @ H.mT + R
             v = zero_missing(filled[..., t, :] - m @ H.mT - offset[..., t, :], seen)
             weights.append(innovation_weights(v, S, noise, seen, robust, threshold).to(mean.dtype))
-            if t + 1 == steps[-1]:
+            if t + 1 == reset.shape[-1]:
                 break
             A = masked_cov(S + torch.diag_embed(noise / weights[-1] - noise), seen)
             cross = zero_missing(cross, seen.unsqueeze(-1))

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix, factorise, without_autocast
 from torchrl_drbpn.functional.kalman import predict, update, update_by_mask
-from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP
+from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, TransitionMLP
 
 __all__ = ["Forecast", "Jacobian", "forecast", "row_jacobian", "smooth_sequence"]
 
@@ -92,21 +92,22 @@ def smooth_sequence(
 
     See also :func:`filter_sequence`, which reads the past alone.
     """
-    steps, belief = tuple(reset.shape), _start(model, mean, cov)
-    model.check_inputs(
-        steps, steps[:-1], mean, previous_action, observation, observed, reset,
-        cov=belief.cov.to(mean.dtype),
+    belief = _start(model, mean, cov)
+    given = FilterInputs(
+        observation, observed, previous_action, reset, None, None, mean, None,
+        belief.cov.to(mean.dtype),
     )  # fmt: skip
+    model.check_inputs(given, reset.shape[:-1])
     H, offset, dtype = model.emission_matrix, model.offset(previous_action), mean.dtype
     with without_autocast(mean):
         filtered, predictions = [], []
-        for t in range(steps[-1]):
+        for t in range(reset.shape[-1]):
             R = model.emission_cov if emission_cov is None else emission_cov[..., t, :, :]
             step = _predict(model, belief, previous_action[..., t, :], jacobian, reset[..., t])
-            given = (observation[..., t, :], observed[..., t, :], H, R, offset[..., t, :])
-            belief = update(step.predicted, *given)
+            arrived = (observation[..., t, :], observed[..., t, :], H, R, offset[..., t, :])
+            belief = update(step.predicted, *arrived)
             if model.mask_model is not None:
-                belief, _ = update_by_mask(belief, *given, model.mask_model)
+                belief, _ = update_by_mask(belief, *arrived, model.mask_model)
             filtered.append(belief)
             predictions.append(step)
         smoothed = filtered[-1:]

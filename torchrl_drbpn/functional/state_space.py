@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix
 from torchrl_drbpn.functional.kalman import MaskModel
 
-__all__ = ["StateSpace", "TransitionMLP", "predict_step", "propagate"]
+__all__ = ["FilterInputs", "StateSpace", "TransitionMLP", "predict_step", "propagate"]
 
 # Of a propagated variance, state units: under a transition that expands, what no sensor has seen
 # for thousands of steps would leave the range of float32. The correlations stay.
@@ -93,6 +93,30 @@ class TransitionMLP(NamedTuple):
         if not self.residual:
             return found
         return found + torch.eye(state, dtype=mean.dtype, device=mean.device)
+
+
+class FilterInputs(NamedTuple):
+    """Hold the arguments of :func:`filter_sequence`, in the order of the native operator."""
+
+    observation: Tensor
+    observed: Tensor
+    previous_action: Tensor
+    reset: Tensor
+    use_stored_state: Tensor | None
+    stored_mean: Tensor | None
+    mean: Tensor
+    stored_cov: Tensor | None = None
+    cov: Tensor | None = None
+    weight: Tensor | None = None
+
+    def before(self, t: int, mean: Tensor, cov: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Return the belief that step t starts from: the one before, or what is stored."""
+        if self.use_stored_state is None or self.stored_mean is None:
+            return mean, cov
+        use = self.use_stored_state[..., t, None]
+        if cov is not None and self.stored_cov is not None:
+            cov = torch.where(use.unsqueeze(-1), self.stored_cov[..., t, :, :], cov)
+        return torch.where(use, self.stored_mean[..., t, :], mean), cov
 
 
 @dataclass(eq=False)
@@ -194,37 +218,24 @@ class StateSpace:
                     f"{H.device}: all fields must agree."
                 )
 
-    def check_inputs(
-        self,
-        steps: tuple[int, ...],
-        start: tuple[int, ...],
-        mean: Tensor,
-        previous_action: Tensor,
-        observation: Tensor,
-        observed: Tensor,
-        reset: Tensor,
-        use_stored_state: Tensor | None = None,
-        stored_mean: Tensor | None = None,
-        stored_cov: Tensor | None = None,
-        cov: Tensor | None = None,
-        weight: Tensor | None = None,
-    ) -> None:
-        """Raise unless means and cov are ``(*start, n)``, others ``(*steps, n)``, of its dtype."""
+    def check_inputs(self, given: FilterInputs, start: tuple[int, ...]) -> None:
+        """Raise unless mean and cov are ``(*start, n)``, others as reset is, of the own dtype."""
         obs, state, action = self.obs_dim, self.state_dim, self.action_dim
-        own, flag = self.emission_matrix.dtype, torch.bool
-        wanted: tuple[tuple[str, Tensor | None, torch.dtype, str, tuple[int, ...]], ...] = (
-            ("reset", reset, flag, "", steps),
-            ("observed", observed, flag, " obs", (*steps, obs)),
-            ("observation", observation, own, " obs", (*steps, obs)),
-            ("previous_action", previous_action, own, " action", (*steps, action)),
-            ("mean", mean, own, " state", (*start, state)),
-            ("use_stored_state", use_stored_state, flag, "", steps),
-            ("stored_mean", stored_mean, own, " state", (*steps, state)),
-            ("weight", weight, own, " obs", (*steps, obs)),
-            ("cov", cov, own, " state, state", (*start, state, state)),
-            ("stored_cov", stored_cov, own, " state, state", (*steps, state, state)),
-        )
-        for name, value, dtype, word, shape in wanted:
+        own, flag, steps = self.emission_matrix.dtype, torch.bool, tuple(given.reset.shape)
+        wanted: dict[str, tuple[torch.dtype, str, tuple[int, ...]]] = {
+            "reset": (flag, "", steps),
+            "observed": (flag, " obs", (*steps, obs)),
+            "observation": (own, " obs", (*steps, obs)),
+            "previous_action": (own, " action", (*steps, action)),
+            "mean": (own, " state", (*start, state)),
+            "use_stored_state": (flag, "", steps),
+            "stored_mean": (own, " state", (*steps, state)),
+            "weight": (own, " obs", (*steps, obs)),
+            "cov": (own, " state, state", (*start, state, state)),
+            "stored_cov": (own, " state, state", (*steps, state, state)),
+        }
+        for name, (dtype, word, shape) in wanted.items():
+            value: Tensor | None = getattr(given, name)
             if value is None or (value.shape == shape and value.dtype == dtype):
                 continue
             hint = "Was the model built for another environment? `reset` says the batch."
@@ -237,6 +248,7 @@ class StateSpace:
                 f"`{name}` must be {kinds[0]} of shape (*batch,{word}) = {shape}, got {kinds[1]} "
                 f"{tuple(value.shape)}. {hint}"
             )
+        weight = given.weight
         if weight is None or torch.compiler.is_compiling() or weight.is_meta:
             return
         try:
