@@ -305,15 +305,13 @@ class _Filter(torch.autograd.Function):
     """The derivative; one that is differentiated again runs in PyTorch."""
 
     @staticmethod
-    def forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return torch.ops.torchrl_drbpn.filter_rows_forward(*arguments)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.rest = inputs[_TENSORS:]
-        ctx.save_for_backward(output[2], *inputs[:_TENSORS])
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        output = torch.ops.torchrl_drbpn.filter_rows_forward(*arguments)
+        ctx.rest = arguments[_TENSORS:]
+        ctx.save_for_backward(output[2], *arguments[:_TENSORS])
         ctx.mark_non_differentiable(*output[2:])
         ctx.set_materialize_grads(False)
+        return output
 
     @staticmethod
     def backward(ctx: Any, *by_outputs: Tensor | None) -> tuple[Any, ...]:
@@ -337,6 +335,13 @@ class _Filter(torch.autograd.Function):
         )
         found = {id(x): g for x, g in zip(wanted, gradients, strict=True)}
         return *(found.get(id(x)) for x in saved), None, None, None
+
+
+def _differentiable(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Run the operator; acting asks for no gradient, and keeping one costs as much as a step."""
+    if torch.is_grad_enabled():
+        return _Filter.apply(*arguments)  # type: ignore[no-untyped-call]
+    return torch.ops.torchrl_drbpn.filter_rows_forward(*arguments)
 
 
 def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], Any]:
@@ -373,5 +378,5 @@ for _name, _more, _out, _run, _fake in (
     _LIBRARY.define(f"{_name}({_more}{_ARGUMENTS}) -> {_out}")
     _LIBRARY.impl(_name, _run, "CPU")
     torch.library.register_fake(f"torchrl_drbpn::{_name}", _fake, lib=_LIBRARY)
-_LIBRARY.impl("filter_rows", _Filter.apply, "Autograd")
+_LIBRARY.impl("filter_rows", _differentiable, "Autograd")
 torch.library.register_vmap("torchrl_drbpn::filter_rows", _vmap, lib=_LIBRARY)
