@@ -289,9 +289,10 @@ def test_a_filter_that_propagates_ends_in_its_smoothed_belief_and_forecasts_by_i
     assert_equal(ahead.state.cov, unseen.cov)
 
 
-def test_the_row_wise_jacobian_is_that_of_autograd_and_can_be_differentiated():
-    problem = Problem(3, 4)
-    f, mean = problem.model().transition, torch.randn(2, 3, dtype=torch.float64)
+@pytest.mark.parametrize("closed", [False, True])
+def test_the_row_wise_jacobian_is_that_of_autograd_and_can_be_differentiated(closed):
+    network, mean = Problem(3, 4).model().transition, torch.randn(2, 3, dtype=torch.float64)
+    f = network if closed else lambda m, a: network(m, a)
     action = torch.randn(2, 2, dtype=torch.float64)
     found = row_jacobian(f, mean, action)
     for row in range(2):

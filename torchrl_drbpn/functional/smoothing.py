@@ -9,7 +9,6 @@ which is then counted twice and makes the covariances too wide: train with
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -184,7 +183,7 @@ def forecast(
 def row_jacobian(
     transition: TransitionMLP | Callable[[Tensor, Tensor], Tensor], mean: Tensor, action: Tensor
 ) -> Tensor:
-    """Differentiate a transition by the mean, each row by itself.
+    """Differentiate a transition by the mean, each row by itself; a network in closed form.
 
     Args:
         transition: f of (mean, action), row by row.
@@ -200,6 +199,8 @@ def row_jacobian(
         >>> torch.equal(F, 5 * torch.eye(3).expand(2, 3, 3))
         True
     """
+    if isinstance(transition, TransitionMLP):
+        return transition.jacobian(mean, action)
     state = mean.shape[-1]
     # Rows do not mix, so the derivative of their sum holds that of each.
     by_row = torch.func.jacrev(lambda m: transition(m, action).reshape(-1, state).sum(0))(mean)
@@ -220,19 +221,18 @@ def _predict(
     """Predict one step in float64; at a reset the initial belief, on which F = 0 lets nothing."""
     row, dtype = reset.unsqueeze(-1), model.emission_matrix.dtype
     mean = belief.mean.masked_fill(row, 0.0).to(dtype)
-    f, F = model.transition, model.transition_jacobian if jacobian is None else jacobian
+    F = model.transition_jacobian if jacobian is None else jacobian
     if F is None:
-        by_row = f.jacobian if isinstance(f, TransitionMLP) else functools.partial(row_jacobian, f)
-        F = by_row(mean, action)
+        F = row_jacobian(model.transition, mean, action)
     elif not isinstance(F, Tensor):
         F = F(mean, action)
     Q = model.transition_cov
     Q = as_matrix("transition_cov", Q if isinstance(Q, Tensor) else Q(mean, action), mean.shape[-1])
     F, Q, block = F.double(), Q.double(), row.unsqueeze(-1)
     F = torch.where(block, 0.0, F)
-    before = Belief(mean.double(), belief.cov.masked_fill(block, 0.0))
-    cov = predict(before, lambda m, _: m, Q, action, jacobian=F).cov
     moved = model.predicted_mean(mean, action, row).double()
+    before = Belief(mean, belief.cov.masked_fill(block, 0.0))
+    cov = predict(before, lambda *_: moved, Q, action, jacobian=F).cov
     cov = torch.where(block, model.full_initial_cov().double(), cov)
     return _Step(Belief(moved, cov), F, Q)
 

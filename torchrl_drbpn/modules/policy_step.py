@@ -194,12 +194,10 @@ class PolicyStep(nn.Module):
             moved, P = filter.transition(mean, previous_action)
             P = Q = P.to(H.dtype)
         if cov is not None and self.propagated:
-            row = filter.jacobian == "row"
-            F = jacobian_of(filter.transition, mean, previous_action) if row else None
-            moved_cov = propagate(
-                filter.mean_jacobian if F is None else F, cov.masked_fill(first, 0.0)
-            )
-            P = moved_cov.to(H.dtype) + Q
+            F = filter.mean_jacobian
+            if filter.jacobian == "row":
+                F = jacobian_of(filter.transition, mean, previous_action)
+            P = propagate(F, cov.masked_fill(first, 0.0)).to(H.dtype) + Q
         m = torch.where(is_init, filter.initial_mean, moved)
         wants_cov, filtered_cov = self.propagated or self.policy_input == "mean_cov", None
         # A product and a sum, not a matmul: Inductor fuses it with what surrounds it.

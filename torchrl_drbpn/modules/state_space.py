@@ -228,11 +228,11 @@ def jacobian_of(
     In closed form for a GaussianTransition whose ``forward`` is its own, by torch.func for another.
     Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
     """
-    f, state = transition_functions(transition)[0], mean.shape[-1]
-    if isinstance(f, TransitionMLP):
-        return f.jacobian(mean, action, average=average)
+    f = transition_functions(transition)[0]
+    if average and isinstance(f, TransitionMLP):
+        return f.jacobian(mean, action, average=True)
     rows = row_jacobian(f, mean, action)
-    return rows.reshape(-1, state, state).mean(0) if average else rows
+    return rows.reshape(-1, *rows.shape[-2:]).mean(0) if average else rows
 
 
 def transition_functions(
