@@ -271,15 +271,25 @@ class BeliefFilter(nn.Module):
     ) -> FilterOutput:
         """Filter one step; arguments, result and errors as in :meth:`forward`, without time."""
         given = (mean, previous_action, observation, observed, reset)
+        return self._run(filter_step, robust_weights, given, {"cov": cov}, return_cov)
+
+    def _run(
+        self,
+        filter: Callable[..., FilterOutput],
+        weigh: Callable[..., Tensor],
+        given: tuple[Tensor, ...],
+        start: dict[str, Tensor | None],
+        return_cov: bool,
+    ) -> FilterOutput:
+        """Filter, by weighted readings where the update is robust, and check what comes out."""
         model = self.state_space()
 
         def run() -> FilterOutput:
             weight = None
-            if (robust := self.robust) is not None:
-                weight = robust_weights(
-                    model, *given, cov=cov, robust=robust, threshold=self.robust_threshold
-                )
-            return filter_step(model, *given, cov=cov, weight=weight, return_cov=return_cov)
+            if self.robust is not None:
+                by = {"robust": self.robust, "threshold": self.robust_threshold}
+                weight = weigh(model, *given, **start, **by)
+            return filter(model, *given, **start, weight=weight, return_cov=return_cov)
 
         return checked(run, self.validate, *given[:4])
 
@@ -307,21 +317,11 @@ class BeliefFilter(nn.Module):
             ValueError: for a shape, a dtype or an observed value that cannot be.
         """
         given = (mean, previous_action, observation, observed, reset)
-        model = self.state_space()
-        stored: dict[str, Any] = {
+        start = {
             "cov": cov, "use_stored_state": use_stored_state, "stored_mean": stored_mean,
             "stored_cov": stored_cov,
         }  # fmt: skip
-
-        def run() -> FilterOutput:
-            weight = None
-            if (robust := self.robust) is not None:
-                weight = robust_sequence_weights(
-                    model, *given, **stored, robust=robust, threshold=self.robust_threshold
-                )
-            return filter_sequence(model, *given, **stored, weight=weight, return_cov=return_cov)
-
-        return checked(run, self.validate, *given[:4])
+        return self._run(filter_sequence, robust_sequence_weights, given, start, return_cov)
 
     def predict(
         self, mean: Tensor, previous_action: Tensor, reset: Tensor, cov: Tensor | None = None

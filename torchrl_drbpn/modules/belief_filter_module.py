@@ -121,17 +121,16 @@ class BeliefFilterModule(RecurrentBeliefModule):
         if not self.recurrent_mode:
             out = self.filter.step(mean, cov, *readings, return_cov=want_cov)
         else:
-            use, time = given.use_stored_state, given.reset.ndim - 1
+            time = given.reset.ndim - 1
 
             def first(x: Tensor) -> Tensor:  # the sum of one step, or of none if there is no time
                 return x.narrow(time, 0, min(1, x.shape[time])).sum(time)
 
             out = self.filter(
-                first(mean), None if cov is None else first(cov), *readings, use_stored_state=use,
-                stored_mean=mean, stored_cov=cov, return_cov=want_cov,
+                first(mean), None if cov is None else first(cov), *readings,
+                use_stored_state=given.use_stored_state, stored_mean=mean, stored_cov=cov,
+                return_cov=want_cov,
             )  # fmt: skip
-            mean = _before(mean, out.mean, use)
-            cov = cov if cov is None or out.cov is None else _before(cov, out.cov, use)
         features = out.mean
         if self.policy_input == "mean_cov" and out.cov is not None:
             features = torch.cat([out.mean, tril_to_vector(out.cov)], -1)
@@ -142,14 +141,18 @@ class BeliefFilterModule(RecurrentBeliefModule):
             ("belief", "cov"): out.cov,
         }
         if any(name not in results for name in self._out):
+            if self.recurrent_mode:
+                mean = _before(mean, out.mean, given.use_stored_state)
+                if cov is not None and out.cov is not None:
+                    cov = _before(cov, out.cov, given.use_stored_state)
             emission, action = self.filter.emission, given.previous_action
             predicted = self.filter.predict(mean, action, given.reset, cov)
             results["belief", "observation"] = emission(out.mean, action)
             results["belief", "predicted_observation"] = emission(predicted.mean, action)
             if ("belief", "innovation_cov") in self._out:
-                results["belief", "innovation_cov"] = innovation(
-                    predicted, given.observation, given.observed, emission.matrix, emission.cov()
-                ).cov
+                H, R = emission.affine()[0], emission.cov()
+                compared = innovation(predicted, given.observation, given.observed, H, R)
+                results["belief", "innovation_cov"] = compared.cov
         after = [out.mean] if cov is None or out.cov is None else [out.mean, out.cov]
         return self._write(tensordict, results, (*after, given.age + 1))
 
