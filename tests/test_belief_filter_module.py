@@ -11,7 +11,7 @@ from small_agents import make_filter as make_any_filter
 from tensordict import TensorDict, TensorDictBase
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn import BeliefFilterModule, functional
+from torchrl_drbpn import BeliefFilter, BeliefFilterModule, LinearGaussianEmission, functional
 
 OPTIONAL = (
     ("belief", "cov"),
@@ -165,6 +165,20 @@ def test_optional_entries_equal_the_textbook(state, cov_network, over_time):
                 (("belief", "innovation_cov"), S),
             ):
                 torch.testing.assert_close(out[key][b, t], expected, rtol=1e-10, atol=1e-10)
+
+
+def test_an_innovation_covariance_is_that_of_an_emission_with_a_forward_of_its_own():
+    class Doubled(LinearGaussianEmission):
+        def forward(self, state, previous_action):
+            return 2.0 * super().forward(state, previous_action)
+
+    emission = Doubled(OBS, OBS, ACTION, dtype=torch.float64)
+    model = BeliefFilter(OBS, ACTION, emission=emission, dtype=torch.float64)
+    key = ("belief", "innovation_cov")
+    out = BeliefFilterModule(model, out_keys=[key])(with_state(make_frames((3,)), OBS))
+    for S, first in zip(out[key], out["is_init"], strict=True):
+        P = model.initial_cov if first else model.transition.cov()
+        torch.testing.assert_close(S, 4 * P + emission.cov())
 
 
 def test_an_innovation_covariance_has_the_digits_of_innovation():

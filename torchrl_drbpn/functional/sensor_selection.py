@@ -197,15 +197,16 @@ def _as_target(C: Tensor | None, H: Tensor) -> Tensor:
     """Return C in float64 and in H's batch shape; the identity where there is none."""
     state, batch = H.shape[-1], H.shape[:-2]
     C = torch.eye(state, dtype=H.dtype, device=H.device) if C is None else C.double()
-    try:
-        if C.ndim >= 2 and C.shape[-1] == state and bool(C.isfinite().all()):
-            return C.expand(*batch, *C.shape[-2:])
-    except RuntimeError:  # a batch shape of its own: refused below
-        pass
-    raise ValueError(
-        f"`target` must be finite and of shape (*batch, target, state) with state={state} and "
-        f"the batch shape {tuple(batch)} of the model or none, got {tuple(C.shape)}."
+    own = C.shape[:-2]
+    fits = len(own) <= len(batch) and all(
+        n in (1, of_model) for n, of_model in zip(own[::-1], batch[::-1], strict=False)
     )
+    if C.ndim < 2 or C.shape[-1] != state or not fits or not bool(C.isfinite().all()):
+        raise ValueError(
+            f"`target` must be finite and of shape (*batch, target, state) with state={state} and "
+            f"the batch shape {tuple(batch)} of the model or none, got {tuple(C.shape)}."
+        )
+    return C.expand(*batch, *C.shape[-2:])
 
 
 def _as_indices(always: Sequence[int] | Sequence[bool] | Tensor, obs: int) -> list[int]:
