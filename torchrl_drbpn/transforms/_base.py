@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, TypedDict
@@ -224,7 +225,7 @@ class CorruptionKeys(TypedDict, total=False):
     complete_key: Keys | None
 
 
-class CorruptingTransform(Transform):
+class CorruptingTransform(Transform, ABC):
     """The frame of the transforms that change what arrives: keys, masks, specs, step and reset.
 
     Several observation keys count as one vector, in the order of `in_keys`, so that one law holds
@@ -265,9 +266,9 @@ class CorruptingTransform(Transform):
             for following in sorted(set(of_next))
         ]
 
+    @abstractmethod
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
         """Return the observation as it arrives, and which entries do; None for all."""
-        raise NotImplementedError
 
     def _check_obs_dim(self, obs_dim: int) -> None:
         """Raise a ValueError where the transform was made for another number of components."""

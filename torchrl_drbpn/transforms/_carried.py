@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from numbers import Integral
 from typing import Any, ClassVar, Unpack
@@ -124,9 +125,9 @@ class CarriedStateTransform(SeededTransform):
             )
 
     # ------------------------------------------------------------------------------------- state
+    @abstractmethod
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         """Return shape behind the batch and dtype of each state; None: that of the observation."""
-        raise NotImplementedError
 
     def _carried(self, step: Step) -> list[Tensor] | None:
         """Return the states after the step before, None at a reset."""
