@@ -26,7 +26,6 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the smoke experiment of the recipe once, to its end; nobody may change its folder."""
-    pytest.importorskip("hydra")
     from recipe_tools import SMOKE, run
 
     folder = tmp_path_factory.mktemp("run") / "smoke"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -19,13 +17,9 @@ _NAMES = (
 )
 TASKS = [f"{name}-{version}" for name in _NAMES.split() for version in ("v4", "v5")]
 
-_without_envpool = pytest.mark.skipif(
-    importlib.util.find_spec("envpool") is None,
-    reason="EnvPool is not installed: pip install 'torchrl-drbpn[envpool]'",
-)
 BACKENDS = [
     pytest.param(GymnasiumBatchEnv, id="gymnasium"),
-    pytest.param(EnvPoolBatchEnv, id="envpool", marks=_without_envpool),
+    pytest.param(EnvPoolBatchEnv, id="envpool"),
 ]
 
 

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import csv
-import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-from recipe_tools import ROOT  # isort: skip
-
-sys.path.insert(0, str(ROOT / "recipes"))
 import evaluate as recipe
 from evaluation.conditions import Condition, parse_condition
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
+from recipe_tools import ROOT
 
 
 def configured(command: str = "evaluate", *overrides: str) -> dict[str, Any]:

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -333,10 +332,11 @@ def joint_log_likelihood(system: LinearSystem, data: Data, row: int) -> Tensor:
 
 
 def statsmodels(system: LinearSystem, data: Data) -> Any:
-    """Bind the first row to statsmodels' filter and smoother, or skip the test."""
-    statespace = pytest.importorskip("statsmodels.tsa.statespace.kalman_smoother")
+    """Bind the first row to statsmodels' filter and smoother."""
+    from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
+
     x, observed, action = data.observation[0], data.observed[0], data.previous_action[0]
-    theirs = statespace.KalmanSmoother(k_endog=system.obs_dim, k_states=system.state_dim)
+    theirs = KalmanSmoother(k_endog=system.obs_dim, k_states=system.state_dim)
     theirs.bind(torch.where(observed, x, torch.nan).numpy())
     moves = action[1:] @ system.control.T  # theirs lead from a step to the next
     last = torch.zeros(1, system.state_dim, dtype=torch.float64)

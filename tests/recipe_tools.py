@@ -13,16 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
+from training.config import composed_config
+from training.run_folder import resumed_config
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
-if str(ROOT / "recipes") not in sys.path:
-    sys.path.insert(0, str(ROOT / "recipes"))
-
-from omegaconf import DictConfig  # noqa: E402
-from training.config import composed_config  # noqa: E402
-from training.run_folder import resumed_config  # noqa: E402
-
 # Every belief module of the recipe, found on disk: a new one is tested without an edit here.
 BELIEFS = sorted(path.stem for path in (CONF / "belief").glob("*.yaml"))
 

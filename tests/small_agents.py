@@ -72,6 +72,8 @@ def make_filter(
             for parameter in belief.parameters():
                 if perturb:
                     parameter += 0.1 * torch.randn_like(parameter)
+    if belief.covariance == "propagated":
+        belief.refresh_jacobian(belief.initial_mean, belief.initial_mean.new_zeros(action))
     return belief
 
 

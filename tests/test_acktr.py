@@ -12,13 +12,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDictBase
-
-pytest.importorskip("hydra")
-from recipe_tools import assembled, differences, read_table, resume, run  # isort: skip
-
 from algorithms.acktr import ACKTR
 from ppo_drbpn import collect, train_rollout
+from recipe_tools import assembled, differences, read_table, resume, run
+from tensordict import TensorDictBase
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.errors import UserError
 from training.ppo import add_advantages

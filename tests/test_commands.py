@@ -8,11 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-from evaluation_tools import configured  # isort: skip
-
+from evaluation_tools import configured
 from training.config import command
 from training.errors import UserError
 

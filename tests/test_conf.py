@@ -9,12 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("hydra")
-from recipe_tools import CONF, assembled, command, make_config  # isort: skip
-
 from evaluation.points import missingness_kind, missingness_name
 from omegaconf import OmegaConf
+from recipe_tools import CONF, assembled, command, make_config
 from training.config import choice
 from training.envs import env_name
 from training.errors import UserError

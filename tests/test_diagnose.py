@@ -16,15 +16,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import diagnose
 import pandas as pd
 import pytest
 import torch
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-from evaluation_tools import parse, read_rows  # isort: skip
-
-import diagnose
 from analysis import calibration as diagnosis
 from analysis.calibration import Compared, Tally, class_names, gaussian_crps
 from analysis.calibration_figures import outage_figure
@@ -36,6 +31,7 @@ from analysis.calibration_tables import (
 )
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation_tools import parse, read_rows
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 from torch import Tensor

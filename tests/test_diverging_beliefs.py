@@ -5,18 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import diagnose as diagnose_recipe
 import numpy as np
 import pytest
 import torch
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-from evaluation_tools import evaluate, parse, read_rows  # isort: skip
-
-import diagnose as diagnose_recipe
 from analysis.calibration import diagnose
 from evaluation.table import Protocol, evaluate_condition
 from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation_tools import evaluate, parse, read_rows
 from training.config import explained
 from training.errors import UserError
 

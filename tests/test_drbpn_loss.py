@@ -18,22 +18,24 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss, MaskedObservationNorm
 
 PPO_TERMS = ("loss_objective", "loss_critic", "loss_entropy")
+filters = pytest.mark.parametrize("covariance", ["constant", "propagated"])
 
 
-def make_belief_agent(dtype: torch.dtype = torch.float64, features: str = "features") -> Agent:
-    belief = BeliefFilterModule(make_filter(OBS, ACTION, dtype))
-    return make_agent(belief, belief.feature_dim, features=features, dtype=dtype)
+def make_belief_agent(dtype: torch.dtype = torch.float64, covariance: str = "constant") -> Agent:
+    belief = BeliefFilterModule(make_filter(OBS, ACTION, dtype, covariance=covariance))
+    return make_agent(belief, belief.feature_dim, dtype=dtype)
 
 
 @functools.cache
-def rollout(dtype: torch.dtype = torch.float64) -> TensorDictBase:
+def rollout(*args) -> TensorDictBase:
     """Fresh data of `make_belief_agent`, with advantages; cloned by `make_data`."""
-    agent = make_belief_agent(dtype)
+    agent = make_belief_agent(*args)
+    dtype = next(agent.belief.parameters()).dtype
     return add_advantages(agent, collect(agent, dtype=dtype))
 
 
-def make_data(dtype: torch.dtype = torch.float64) -> TensorDictBase:
-    data = rollout(dtype).clone()
+def make_data(*args) -> TensorDictBase:
+    data = rollout(*args).clone()
     final = torch.zeros(*data.shape, 1, dtype=torch.bool)
     final[:, -1] = True
     return data.set("final", final)
@@ -212,6 +214,7 @@ def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
     f = model.transition.mean_network()
     transition = oracles.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)
     H, R, Q = model.emission.matrix, model.emission.cov(), model.transition.cov()
+    F = model.mean_jacobian if model.covariance == "propagated" else None
     total, entries = torch.zeros((), dtype=torch.float64), 0
 
     def receive(belief, frame):
@@ -224,8 +227,9 @@ def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
         return oracles.update(*step)
 
     def move(belief, frame):
+        mean, cov = belief  # what is propagated is a constant of the gradient
         action = frame["previous_action"].to(torch.float64)
-        return oracles.predict(*belief, transition, Q, action)
+        return oracles.predict(mean, cov.detach(), transition, Q, action, F)
 
     for row in data.unbind(0):
         belief = None
@@ -233,15 +237,16 @@ def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
             if frame["is_init"]:
                 belief = receive((model.initial_mean, model.initial_cov), frame)
             elif t == 0:
-                stored = (frame["recurrent", "mean"], Q)
+                stored = (frame["recurrent", "mean"], frame.get(("recurrent", "cov"), Q))
                 belief = receive(move(stored, frame), frame)
             belief = receive(move(belief, frame["next"]), frame["next"])
     return total, entries
 
 
+@filters
 @pytest.mark.parametrize("length", [TIME, 12, 6, 1])
-def test_every_received_observation_counts_once_however_the_rollout_is_cut(length):
-    agent, data = make_belief_agent(), make_data()
+def test_every_received_observation_counts_once_however_the_rollout_is_cut(length, covariance):
+    agent, data = (make(torch.float64, covariance) for make in (make_belief_agent, make_data))
     assert data["next", "terminated"][:, :-1].any()
     assert data["next", "truncated"][:, :-1].any()
     assert data["is_init"].sum() > 3
@@ -266,8 +271,9 @@ def test_final_adds_the_observation_after_the_cut_and_nothing_else():
     assert not differs[:, :-1].any()
 
 
-def test_the_next_observation_is_predicted_from_the_live_belief_with_its_gradient():
-    agent, data = make_belief_agent(), make_data()
+@filters
+def test_the_next_observation_is_predicted_from_the_live_belief_with_its_gradient(covariance):
+    agent, data = (make(torch.float64, covariance) for make in (make_belief_agent, make_data))
     with torch.no_grad():
         for parameter in agent.belief.parameters():
             parameter += 0.05  # not the filter that collected

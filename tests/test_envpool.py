@@ -20,10 +20,6 @@ from torchrl.envs import check_env_specs
 
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
-pytest.importorskip(
-    "envpool", reason="EnvPool is not installed: pip install 'torchrl-drbpn[envpool]'"
-)
-
 # Version 4 is tested on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date")
 

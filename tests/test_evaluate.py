@@ -14,14 +14,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import evaluate as recipe
 import numpy as np
+import pandas as pd
 import pytest
 import torch
-
-pytest.importorskip("hydra")
-from evaluation_tools import configured, evaluate, parse, read_rows  # isort: skip
-import evaluate as recipe
-import pandas as pd
 from analysis.figures import draw_evaluation
 from evaluation import episodes as episodes_room
 from evaluation import table as table_room
@@ -31,6 +28,7 @@ from evaluation.folders import find_folders, override
 from evaluation.sensor_choice import kept_sensors
 from evaluation.table import evaluate_tasks
 from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation_tools import configured, evaluate, parse, read_rows
 from omegaconf import DictConfig
 from training.errors import UserError
 from training.run_folder import read_config, write_config

@@ -16,25 +16,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import export as recipe
 import pytest
 import torch
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-from evaluation_tools import ROOT, configured  # isort: skip
-
-import export as recipe
+from evaluation_tools import ROOT, configured
 from training.errors import UserError
 
 DEPLOY = ROOT / "docs" / "deploy"
 WALKER = ROOT / "agents" / "walker2d"
-onnx = pytest.mark.skipif(
-    not all(map(recipe.importlib.util.find_spec, recipe.PACKAGES)), reason="needs the extra onnx"
-)
 compiled = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 KINDS = [
     pytest.param("export", "p.pt2", id="export"),
-    pytest.param("onnx", "p.onnx", id="onnx", marks=onnx),
+    pytest.param("onnx", "p.onnx", id="onnx"),
     pytest.param("aoti", "p.pt2", id="aoti", marks=[compiled, pytest.mark.slow]),
 ]
 
@@ -89,8 +82,8 @@ def test_a_file_decides_as_the_agent_with_nan_or_a_mask(
         ("drbpn", {"robots": 0}, "`robots` must be at least 1, got 0"),
         ("gru", {"format": "export"}, "`run` must hold a belief filter .* got belief=gru"),
         ("none", {"format": "export"}, "`run` must hold a belief filter .* got belief=none"),
-        pytest.param("drbpn", {"out": "p.onnx", "robust": "huber"},
-                     "`format=onnx`: `sequential` needs .*`robust` None", marks=onnx),
+        ("drbpn", {"out": "p.onnx", "robust": "huber"},
+         "`format=onnx`: `sequential` needs .*`robust` None"),
     ],
 )  # fmt: skip
 def test_what_can_not_be_exported_is_one_line_and_no_file(
@@ -105,7 +98,6 @@ def test_what_can_not_be_exported_is_one_line_and_no_file(
     assert not list(tmp_path.iterdir())
 
 
-@onnx
 def test_a_full_noise_covariance_has_no_onnx_form(
     trained_run: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -140,7 +132,6 @@ def walked(script: str, policy: Path) -> float:
     return float(re.findall(r"return (-?\d+)", done.stdout)[0])
 
 
-@onnx
 def test_the_program_without_torch_walks(tmp_path: Path) -> None:
     assert walked("control_loop_onnx.py", exported(WALKER, tmp_path / "policy.onnx")) > 3000
 

@@ -15,9 +15,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
-
-pytest.importorskip("hydra")
-from recipe_tools import ROOT, read_table  # isort: skip
+from recipe_tools import ROOT, read_table
 
 EXAMPLE = ROOT / "docs" / "extending"
 sys.path[:0] = [str(EXAMPLE), str(ROOT / "docs" / "environment")]

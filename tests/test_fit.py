@@ -11,20 +11,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import fit as recipe
 import numpy as np
 import oracles
 import pandas as pd
 import pytest
+import recipe_tools  # finds recipes/
 import torch
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-import recipe_tools  # finds recipes/  # isort: skip
-from evaluation_tools import configured  # isort: skip
-
-import fit as recipe
+from estimation import fitting
 from estimation.fitting import Sequences, fit, hide, per_entry, run, split
 from estimation.logs import read_log
+from evaluation_tools import configured
 from safetensors.torch import load_file
 from test_functional_smoothing import space
 from training.errors import UserError
@@ -52,7 +49,6 @@ def write(table: pd.DataFrame, path: Path) -> Path:
     if path.suffix == ".csv":
         table.to_csv(path, index=False)
     elif path.suffix == ".parquet":
-        pytest.importorskip("pyarrow")
         table.to_parquet(path)
     else:
         run = table["run"].str.removeprefix("run ").astype(int).to_numpy()
@@ -155,8 +151,8 @@ def test_episodes_are_split_and_every_one_is_somewhere() -> None:
         assert not set(parts[0].tolist()) & set(parts[2].tolist())
 
 
-def sequences(system: oracles.LinearSystem, batch: int, time: int) -> Sequences:
-    data = oracles.simulate(system, batch, time, seed=3)
+def sequences(system: oracles.LinearSystem, batch: int, time: int, seed: int = 3) -> Sequences:
+    data = oracles.simulate(system, batch, time, seed=seed)
     data.reset[:, 0] = True
     data.previous_action[:, 0] = 0
     parts = (data.previous_action, data.observation, data.observed, data.reset)
@@ -175,7 +171,7 @@ def test_windows_of_a_cut_are_the_sequence_and_its_padding_is_reset() -> None:
 def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself() -> None:
     """With actions in units of a thousand, which the scale must take out and put back."""
     system = oracles.random_system(3, 4, seed=1)
-    train, held = sequences(system, 40, 64), sequences(system, 40, 64)
+    train, held = sequences(system, 40, 64), sequences(system, 40, 64, seed=4)
     data = [x._replace(previous_action=1e3 * x.previous_action) for x in (train, held)]
     torch.manual_seed(0)
     transition = GaussianTransition(3, 2, hidden_sizes=[], residual=False)
@@ -189,6 +185,51 @@ def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself() ->
     start = torch.zeros(40, 3)
     truth = filter_sequence(model, start, *held).log_likelihood.sum() / held.observed.sum()
     assert after > truth.item() - 0.08 > before
+
+
+def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it() -> None:
+    system = oracles.random_system(3, 4, seed=1)
+    train, held = sequences(system, 2, 8), sequences(system, 20, 16, seed=4)
+    torch.manual_seed(0)
+    belief_filter = BeliefFilter(4, 2, 3)
+    options = {"length": 8, "batch_size": 8, "max_grad_norm": 10.0, "weight_decay": 0.0}
+    options |= {"steps": 100, "lr": 0.02, "patience": 5, "seed": 0}
+    history = list(fit(belief_filter, train, held, **options))
+    best = max(history)
+    assert history[-6] == best  # then five epochs without a better one
+    assert history[-1] < best - 0.1
+    after = per_entry(run(belief_filter, held), held).item()
+    assert after == pytest.approx(best, abs=2e-3)
+
+
+def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = sequences(oracles.random_system(3, 4), 2, 12)
+    torch.manual_seed(0)
+    belief_filter = BeliefFilter(4, 2, 3, covariance="propagated")
+    calls: list[tuple[Any, ...]] = []
+
+    def watched(own: BeliefFilter, given: Sequences, before: Any = None) -> Any:
+        jacobian = own.mean_jacobian.clone()
+        out = run(own, given, before)
+        f = own.transition.mean_network()
+        mean, action = out.mean[:, :-1], given.previous_action[:, 1:]
+        calls.append((given, before, out, jacobian, f.jacobian(mean, action, average=True)))
+        return out
+
+    monkeypatch.setattr(fitting, "run", watched)
+    options = {"length": 4, "batch_size": 6, "lr": 1e-3, "max_grad_norm": 1.0, "patience": 1}
+    list(fit(belief_filter, data, data, steps=1, seed=0, weight_decay=0.0, **options))
+    (_, _, whole, _, expected), (windows, before, _, jacobian, _), _ = calls
+    torch.testing.assert_close(jacobian, expected)
+    cut = data.cut(4).observation
+    for row, window in enumerate(windows.observation):
+        (place,) = (cut == window).flatten(1).all(1).nonzero().flatten().tolist()
+        episode, step = divmod(4 * place, 12)
+        for found, values in zip(before, whole[:2], strict=True):
+            last = values[episode, step - 1] if step else torch.zeros_like(found[row])
+            torch.testing.assert_close(found[row], last)
 
 
 def test_what_is_hidden_was_there_and_is_the_share_asked_for_in_stretches() -> None:

@@ -7,16 +7,12 @@ saved state as if it had never stopped.
 
 from __future__ import annotations
 
-import pytest
-import torch
-from torch import Tensor, nn
-
-pytest.importorskip("hydra")
-import recipe_tools  # isort: skip  # noqa: F401  (puts the recipes on the path)
-
 import itertools
 
+import pytest
+import torch
 from algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
+from torch import Tensor, nn
 
 N = 40
 NUMBERS = {"lr": 1.0, "momentum": 0.0, "damping": 1e-12, "decay": 0.9, "max_kl": 1e9}

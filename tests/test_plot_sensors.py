@@ -16,20 +16,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import plot_sensors
 import pytest
 import torch
-from tensordict import TensorDict
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-import recipe_tools  # noqa: F401 - finds recipes/  # isort: skip
-
-import plot_sensors
 from analysis.sensor_figures import mean_places, random_orders
 from evaluation.sensor_choice import SensorModel, kept_sensors, learned_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent
 from matplotlib.image import imread
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 from training.errors import UserError
 
 from torchrl_drbpn import BeliefFilterModule, GaussianTransition, LinearGaussianEmission, functional

@@ -9,11 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-
-pytest.importorskip("hydra")
-from recipe_tools import assembled, resume, run  # isort: skip
-
 from ppo_drbpn import train_rollout
+from recipe_tools import assembled, resume, run
 from training.checkpoint import checkpoint_frames
 from training.errors import EnvironmentFault, UserError
 
@@ -33,7 +30,6 @@ def test_workers_must_share_the_simulators_evenly() -> None:
 
 @pytest.mark.slow
 def test_an_address_that_does_not_answer_is_one_line() -> None:
-    pytest.importorskip("ray")
     with pytest.raises(UserError, match=r"127.0.0.1:1`: no Ray cluster answers there") as caught:
         assembled(*RAY, "collector.address=127.0.0.1:1")
     assert "\n" not in str(caught.value)
@@ -42,7 +38,7 @@ def test_an_address_that_does_not_answer_is_one_line() -> None:
 @pytest.fixture
 def cluster() -> Iterator[Any]:
     """A Ray cluster of two nodes with a processor each."""
-    ray = pytest.importorskip("ray")
+    import ray
     from ray.cluster_utils import Cluster
 
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})

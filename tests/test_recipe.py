@@ -25,9 +25,9 @@ from typing import Any
 
 import pytest
 import torch
-
-pytest.importorskip("hydra")
-from recipe_tools import (  # isort: skip
+from evaluation.trained import evaluate_training
+from ppo_drbpn import train_rollout
+from recipe_tools import (
     ROOT,
     SMOKE,
     assembled,
@@ -39,9 +39,6 @@ from recipe_tools import (  # isort: skip
     run,
     saved,
 )
-
-from evaluation.trained import evaluate_training
-from ppo_drbpn import train_rollout
 from tqdm import tqdm
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.console import BAR, show
@@ -88,17 +85,6 @@ def test_each_finished_episode_is_a_row_with_its_raw_return(smoke: Path) -> None
     # The pendulum earns 1 a step and nothing for the step in which it falls.
     for row in episodes:
         assert float(row["return"]) == float(row["length"]) - 1
-
-
-def test_any_environment_of_torchrl_trains_and_resumes_by_its_target(tmp_path: Path) -> None:
-    make = ["env.make._target_=torchrl.envs.GymEnv", "+env.make.env_name=Pendulum-v1"]
-    words = [*SMOKE, "env=torchrl", "env.id=pendulum", *make]
-    run(tmp_path / "run", *words, "total_frames=128")
-    resume(tmp_path / "run", "total_frames=256")
-    (row, *_) = read_table(tmp_path / "run" / "metrics.csv")
-    assert row["missing_ratio"]
-    with pytest.raises(UserError, match=r"`env.observation_keys` .* observation; got x\.$"):
-        run(tmp_path / "other", *words, "env.observation_keys=[x]")
 
 
 @pytest.mark.parametrize(
@@ -167,8 +153,9 @@ def test_evaluation_leaves_the_whole_training_alone() -> None:
     [
         ("belief=drbpn", "env=hopper", "missingness=mar"),
         ("missingness=outages", "missingness.group_by=joint", "noise=spikes"),
+        ("belief=drbpn_propagated", "missingness=mcar"),
     ],
-    ids=["hopper", "outages-spikes"],
+    ids=["hopper", "outages-spikes", "propagated"],
 )
 def test_a_resumed_run_equals_one_that_never_stopped(
     overrides: tuple[str, ...], tmp_path: Path

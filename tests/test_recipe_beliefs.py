@@ -11,15 +11,12 @@ import functools
 
 import pytest
 import torch
-from contracts import ACTION, OBS, RecipeBeliefContract
-from torchrl.modules import set_recurrent_mode
-
-pytest.importorskip("hydra")
-from recipe_tools import BELIEFS, assembled, differences, make_config, saved  # isort: skip
-
 from beliefs import Belief
+from contracts import ACTION, OBS, RecipeBeliefContract
 from omegaconf import DictConfig
 from ppo_drbpn import train_rollout
+from recipe_tools import BELIEFS, assembled, differences, make_config, saved
+from torchrl.modules import set_recurrent_mode
 from training.config import build
 from training.errors import UserError
 from training.run_folder import metric_columns

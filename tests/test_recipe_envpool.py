@@ -12,14 +12,8 @@ import sys
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("hydra")
-pytest.importorskip(
-    "envpool", reason="EnvPool is not installed: pip install 'torchrl-drbpn[envpool]'"
-)
-from recipe_tools import assembled, differences, read_table, resume, run  # isort: skip
-
 from ppo_drbpn import train_rollout
+from recipe_tools import assembled, differences, read_table, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.errors import UserError
 

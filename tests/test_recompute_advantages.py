@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import recipe_tools  # noqa: F401 (the recipes become importable)
 import torch
 from contract_environments import saved
 from recipe_tools import assembled
-
-import recipe_tools  # noqa: F401  # isort: skip (the recipes become importable)
 from training.reward_scale import ReturnStatistics, scale_reward
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.5")

@@ -16,11 +16,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-
-pytest.importorskip("hydra")
-pytest.importorskip("matplotlib")
-from recipe_tools import ROOT, make_config  # isort: skip
-
 from analysis.figures import draw_evaluation, episode_summary
 from analysis.runs import read_runs, write_table
 from analysis.statistics import interquartile_mean, interval, probability_of_improvement, ratio
@@ -29,6 +24,7 @@ from evaluation.episodes import over_episodes
 from evaluation.points import method_name, missingness_name
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import OmegaConf
+from recipe_tools import ROOT, make_config
 from rendering.style import legend_below, panel_grid
 from report import run
 from training.errors import UserError

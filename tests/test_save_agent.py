@@ -5,17 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("hydra")
-pytest.importorskip("safetensors")
-from evaluation_tools import evaluate  # isort: skip
-
 import play
+import pytest
 import save_agent
 import torch
 from evaluation.trained import WEIGHTS, load_trained_agent
-from evaluation_tools import configured
+from evaluation_tools import ROOT, configured, evaluate
 from training.errors import UserError
 
 
@@ -47,6 +42,18 @@ def test_a_saved_agent_acts_as_the_run_did(finished: Path, tmp_path: Path) -> No
     card = (out / "README.md").read_text()
     for text in ("# InvertedPendulum-v5, drbpn", "mcar:0.4", "| 128 |", "| seed | 0 |", "sampled"):
         assert text in card
+
+
+@pytest.mark.parametrize("folder", sorted((ROOT / "agents").iterdir()), ids=lambda path: path.name)
+def test_an_agent_of_the_repository_acts_under_this_code(folder: Path, tmp_path: Path) -> None:
+    trained = load_trained_agent(folder)
+    env = trained.environments()(0)
+    with torch.no_grad():
+        data = env.rollout(20, trained.agent.policy, break_when_any_done=False)
+    assert data["action"].isfinite().all()
+    assert (data["next", "reward"] > 0).float().mean() > 0.9
+    film = {"run": str(folder), "robot": False, "start": 0, "steps": 2, "out": tmp_path / "x.gif"}
+    assert play.run(configured("play") | film) == 0
 
 
 def test_a_run_folder_is_not_written_into_and_broken_weights_are_one_line(

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import gymnasium
 import pytest
-
-pytest.importorskip("hydra")
-from recipe_tools import CONF  # isort: skip
-
 from omegaconf import OmegaConf
+from recipe_tools import CONF
 from training.config import choice
 from training.errors import UserError
 from training.sensors import named_sensors, sensor_groups, sensor_names

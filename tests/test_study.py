@@ -21,17 +21,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-pytest.importorskip("hydra")
-from recipe_tools import CONF, ROOT, command, differences, make_config, read_table, run  # isort: skip
-
 import hydra
+import pytest
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.cell_sweeper import CellSweeper, continued, run_cell
 from omegaconf import DictConfig, OmegaConf
 from ppo_drbpn import train
+from recipe_tools import CONF, ROOT, command, differences, make_config, read_table, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.console import STOP_FILE, StopRequest

@@ -8,7 +8,6 @@ as they are valid. That steps equal sequences over whole rollouts stands in test
 from __future__ import annotations
 
 import pytest
-import recipe_tools  # noqa: F401  (puts the recipes on the path)
 import torch
 from belief_frames import BeliefFrames
 from contract_environments import ACTION, OBS

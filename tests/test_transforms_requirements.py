@@ -218,7 +218,7 @@ OBSERVING = {name: case for name, case in CASES.items() if name != "previous_act
 of_observations = pytest.mark.parametrize("case", OBSERVING.values(), ids=OBSERVING)
 
 
-def same(first: TensorDictBase, second: TensorDictBase) -> None:
+def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
     assert set(first.keys(True, True)) == set(second.keys(True, True))
     for key in first.keys(True, True):
         torch.testing.assert_close(first[key], second[key], rtol=0, atol=0, equal_nan=True)
@@ -279,7 +279,7 @@ def test_any_number_of_rows_is_treated_at_once(case: Case, batch: tuple[int, ...
     assert after.batch_size == data.batch_size
     case.check(data, after)
     composed = Compose(Compose(case.make()))._step(case.root(batch), data.clone())
-    same(after, composed)
+    assert_same(after, composed)
 
 
 @every
@@ -321,7 +321,7 @@ def test_in_front_of_a_model_it_works_or_is_refused(case: Case) -> None:
         return
     after = nn.Sequential(transform, module)(data.clone())
     case.check(data, after)
-    same(transform.inv(data), data)
+    assert_same(transform.inv(data), data)
 
 
 @pytest.mark.parametrize("name", ["reduction", "nan"])
@@ -371,7 +371,7 @@ def test_a_saved_state_goes_on_as_if_never_stopped(case: Case) -> None:
     first, second = case.make(), case.make()
     first._step(root, data.clone())
     second.load_state_dict(saved(first.state_dict()))
-    same(first._step(root, data.clone()), second._step(root, data.clone()))
+    assert_same(first._step(root, data.clone()), second._step(root, data.clone()))
 
 
 @every
@@ -388,7 +388,7 @@ def test_a_copy_goes_its_own_way_from_the_same_state(case: Case, duplicate: Any)
     assert second.container is None
     # stepping the copy first must not advance the original
     received = second._step(root, data.clone())
-    same(received, first._step(root, data.clone()))
+    assert_same(received, first._step(root, data.clone()))
 
 
 @every
@@ -399,7 +399,7 @@ def test_with_a_seed_the_global_generator_is_neither_read_nor_advanced(case: Cas
         state = torch.get_rng_state()
         results.append(case.make()._step(root, data.clone()))
         assert torch.equal(torch.get_rng_state(), state)
-    same(*results)
+    assert_same(*results)
 
 
 @of_observations
@@ -460,7 +460,7 @@ def test_what_lies_under_a_false_mask_is_never_read(case: Case) -> None:
         results.append(case.make()._step(root, data).exclude(COMPLETE))
         assert not results[-1]["observed"][:, 2].any()
         assert results[-1]["observation"].isfinite().all()
-        same(results[0], results[-1])
+        assert_same(results[0], results[-1])
 
 
 @every

@@ -32,6 +32,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 from recipe_tools import ROOT, differences, make_config, read_table, resume, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
