@@ -8,7 +8,19 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, ParallelEnv, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    DoubleToFloat,
+    DTypeCastTransform,
+    EnvBase,
+    GymEnv,
+    InitTracker,
+    ParallelEnv,
+    Transform,
+    TransformedEnv,
+)
+
+from torchrl_drbpn import ObservationMissingness, PreviousAction
 
 OBS, ACTION = 5, 2
 
@@ -91,3 +103,33 @@ def staircase(*transforms: Any, **kwargs: Any) -> TransformedEnv:
 def vectors(value: float = 1.0, batch: tuple[int, ...] = (4,), **more: Any) -> TensorDict:
     """Return observations of one value, as a step would give them."""
     return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
+
+
+def belief_env(primer: Transform | None = None, name: str = "InvertedPendulum-v5") -> EnvBase:
+    """Return an environment that writes what every belief module reads, batch size ()."""
+    env = TransformedEnv(GymEnv(name), Compose())
+    return with_belief_entries(env, primer)
+
+
+def actions_in_float64() -> Transform:
+    """Return the transform that lets a float64 policy act in a simulator of float32 actions."""
+    return DTypeCastTransform(torch.float32, torch.float64, in_keys=[], in_keys_inv=["action"])
+
+
+def with_belief_entries(
+    env: TransformedEnv, primer: Transform | None = None, *, to_float32: bool = True
+) -> TransformedEnv:
+    """Append what every belief module reads; half of the entries are missing.
+
+    In float64 the actions are float64 too, as the policy's are.
+    """
+    for transform in (
+        DoubleToFloat() if to_float32 else actions_in_float64(),
+        PreviousAction(),
+        ObservationMissingness("mcar", 0.5, always_observed=0.0),
+        InitTracker(),
+        primer,
+    ):
+        if transform is not None:
+            env.append_transform(transform)
+    return env

@@ -27,11 +27,13 @@ class LossContract:
     # --- hooks
     def make_loss(self, **kwargs: Any) -> LossModule:
         """Return a loss, equal to every other that this method returns."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must say in `make_loss` what is tested")
 
     def make_loss_data(self, dtype: torch.dtype = torch.float32) -> TensorDict:
         """Return a minibatch, `[batch, time]`."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} must say in `make_loss_data` what is read"
+        )
 
     # --- helpers
     def _total(self, out: TensorDictBase) -> torch.Tensor:

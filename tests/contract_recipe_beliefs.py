@@ -44,7 +44,7 @@ class RecipeBeliefContract(BeliefFrames):
     # --- hooks
     def make_belief(self, obs: int = OBS, action: int = ACTION) -> Belief:
         """Return a belief in float32, equal to every other made with the same arguments."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must say in `make_belief` what is tested")
 
     # --- helpers
     def frames(self, time: int = 6) -> TensorDict:
@@ -134,7 +134,6 @@ class RecipeBeliefContract(BeliefFrames):
             assert torch.equal(rollout[key], before[key]), key
 
     # --- steps and sequences
-
     def test_a_rollout_is_what_sequences_cut_from_it_give(self):
         belief = self.learned_belief()
         _, data = self.collected(belief)
@@ -253,8 +252,6 @@ class RecipeBeliefContract(BeliefFrames):
         self.sequence(belief, self.frames())
         belief.summary()
         assert torch.equal(torch.get_rng_state(), state)
-
-    # --- files and copies
 
     # --- what the recipe asks for besides
     def test_what_it_tells_of_the_sensors_comes_from_the_same_belief(self):

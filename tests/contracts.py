@@ -6,16 +6,18 @@ this package's rule for what a recurrent module starts from: the initial state w
 `is_init & (age == 0)`, else the stored one. `RecipeBeliefContract` is what the recipe needs.
 """
 
-from contract_beliefs import BeliefModuleContract, belief_env, with_belief_entries
+from contract_beliefs import BeliefModuleContract
 from contract_environments import (
     ACTION,
     OBS,
     StaircaseEnv,
+    belief_env,
     gym_env,
     parallel_env,
     saved,
     staircase,
     vectors,
+    with_belief_entries,
     with_transform,
 )  # fmt: skip
 from contract_losses import LossContract

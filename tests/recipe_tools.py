@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import csv
 import functools
-import io
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -13,9 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from contract_environments import saved
 from omegaconf import DictConfig
+from training.checkpoint import last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.run_folder import resumed_config
+
+__all__ = [
+    "BELIEFS", "CONF", "ROOT", "SMOKE", "TIMES", "assembled", "assert_same_run", "command",
+    "differences", "make_config", "make_folder", "read_table", "resume", "run", "saved",
+]  # fmt: skip
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
@@ -70,14 +76,6 @@ def make_folder(folder: Path, *overrides: str) -> Path:
     return folder
 
 
-def saved(state: dict[str, Any]) -> Any:
-    """Return what a file gives back of a state."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
 def command(
     recipe: str, *words: str, cwd: Path, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
@@ -98,6 +96,14 @@ def read_table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return [{k: v for k, v in row.items() if k not in TIMES} for row in rows]
+
+
+def assert_same_run(first: Path, second: Path) -> None:
+    """Two runs left the same tables and the same last checkpoint, to the last bit."""
+    for table in ("metrics.csv", "episodes.csv", "evaluation.csv"):
+        assert read_table(first / table) == read_table(second / table), table
+    states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
+    assert differences(*states) == []
 
 
 def differences(first: Any, second: Any, path: str = "") -> list[str]:

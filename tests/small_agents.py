@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from contract_beliefs import with_belief_entries
+from contract_environments import with_belief_entries
 from tensordict import TensorDictBase
 from tensordict.nn import (
     NormalParamExtractor,

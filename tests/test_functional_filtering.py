@@ -309,6 +309,40 @@ def test_inputs_are_left_as_they_were(form):
     assert all(map(torch.equal, given, before))
 
 
+@pytest.mark.parametrize("propagated", [False, True])
+@pytest.mark.parametrize("full_noise", [False, True])
+@pytest.mark.parametrize("form", ["auto", "step by step"])
+@pytest.mark.parametrize(("state", "obs"), SIZES)
+def test_a_weight_is_a_variance_in_values_and_all_gradients(
+    state, obs, form, full_noise, propagated
+):
+    options = {"full_noise": full_noise, "propagated": propagated}
+    problem = Problem(state, obs, stored=True, weighted=True, **options)
+    assert_same(problem, problem.library(form), problem.oracle())
+
+
+@pytest.mark.parametrize(("state", "obs"), SIZES)
+def test_weights_of_one_change_no_bit_and_of_zero_are_missing_entries(state, obs):
+    problem = Problem(state, obs)
+    weight = torch.ones(problem.observed.shape, dtype=torch.float64)
+    plain, ones = (problem.run("pytorch", weight=w, return_cov=True) for w in (None, weight))
+    for a, b in zip(plain, ones, strict=True):
+        assert torch.equal(a, b)
+    gone = problem.run("pytorch", weight=0 * weight)
+    problem.observed = torch.zeros_like(problem.observed)
+    assert torch.equal(gone.mean, problem.run("pytorch").mean)
+    assert not gone.log_likelihood.any()
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5])
+def test_weights_outside_0_and_1_are_one_line(value: float) -> None:
+    problem = Problem(4, 4)
+    weight = torch.full(problem.observed.shape, value, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"`weight` must lie in \[0, 1\], got") as caught:
+        problem.run("auto", weight=weight)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", ["mean", "previous_action", "observation", "observed"])
 def test_an_input_of_wrong_size_or_dtype_is_one_clear_line(form, name):

@@ -156,15 +156,16 @@ def textbook(problem: Problem, row: int, jacobian: Tensor | None) -> list[tuple[
     return out[::-1]
 
 
-@pytest.mark.parametrize("given", [False, True], ids=["row-wise", "given"])
+@pytest.mark.parametrize("given", ["row-wise", "the model's", "another"])
 def test_a_network_is_smoothed_as_the_textbook_extends_it(given):
-    problem = Problem(3, 4, batch=2, time=6)
-    jacobian = 0.5 * torch.eye(3, dtype=torch.float64) if given else None
+    problem = Problem(3, 4, batch=2, time=6, propagated=given != "row-wise")
+    jacobian = 0.5 * torch.eye(3, dtype=torch.float64) if given == "another" else None
     start, action, x, observed, reset = problem.arguments()
     found = smooth_sequence(
         problem.model(), start, None, action, x, observed, reset, jacobian=jacobian
     )
-    rows = [textbook(problem, row, jacobian) for row in range(2)]
+    F = problem.jacobian if jacobian is None else jacobian
+    rows = [textbook(problem, row, F) for row in range(2)]
     mean = torch.stack([torch.stack([m for m, _ in row]) for row in rows])
     cov = torch.stack([torch.stack([P for _, P in row]) for row in rows])
     assert_equal(found.mean, mean)
@@ -193,23 +194,31 @@ def test_a_reading_of_huge_noise_is_a_missing_one_and_r_per_step_is_r():
 
 
 def test_a_nan_under_a_false_mask_or_before_an_episode_start_changes_nothing():
-    system, data = linear()
-    expected = smooth_sequence(space(system), *inputs(data))
-    arguments = inputs(data)
-    arguments[0] = torch.full_like(arguments[0], math.nan)
-    arguments[1] = torch.full((3, 3, 3), math.nan, dtype=torch.float64)
-    arguments[3] = torch.where(data.observed, data.observation, math.nan)
-    found = smooth_sequence(space(system), *arguments)
-    assert torch.equal(found.mean, expected.mean)
-    assert torch.equal(found.cov, expected.cov)
+    problem, found = Problem(3, 4), []
+    problem.reset[:, 0] = True
+    x, start = problem.leaves["observation"].detach(), problem.leaves["start_mean"].detach()
+    for junk in (0.0, math.nan):
+        problem.leaves["observation"] = x.where(problem.observed, junk).requires_grad_()
+        problem.leaves["start_mean"] = torch.full_like(start, junk).requires_grad_()
+        mean, *rest = problem.arguments()
+        belief = smooth_sequence(problem.model(), mean, torch.full((3, 3, 3), junk).double(), *rest)
+        found.append([*belief, *problem.gradients(tuple(belief)).values()])
+    for clean, spoilt in zip(*found, strict=True):
+        assert torch.equal(clean, spoilt)
 
 
-def test_float32_covariances_stay_positive_definite_at_the_noise_floor():
-    system, data = linear(300, batch=1, reset_rate=0.0)
-    system = oracles.replace(system, noise=1e-4 * torch.eye(4)).to(torch.float32)
+@pytest.mark.parametrize("expands", [0.9, 1.5])
+def test_float32_covariances_stay_positive_definite_at_the_noise_floor(expands):
+    system, data = linear(120, batch=1, reset_rate=0.0)
+    data.observed[:, 2:-3] &= expands < 1  # where it expands, it is lost until the last three
+    system = oracles.replace(
+        system, noise=1e-4 * torch.eye(4), transition_cov=1e-6 * torch.eye(3),
+        dynamics=expands / 0.9 * system.dynamics,
+    ).to(torch.float32)  # fmt: skip
     single = [x.float() if x is not None and x.is_floating_point() else x for x in inputs(data)]
     cov = smooth_sequence(space(system), *single).cov
     assert cov.dtype == torch.float32
+    assert torch.equal(cov, cov.mT)
     assert bool((torch.linalg.cholesky_ex(cov)[1] == 0).all())
 
 

@@ -8,6 +8,7 @@ filter that ignores it is biased, and the one that learned why removes more than
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -141,15 +142,16 @@ def test_gradients_agree_with_finite_differences_at_a_slope_of_zero_too():
     """With the constant covariance: a propagated one is a constant of autograd by design."""
     _, given = high_readings_are_missing(2, 4)
 
-    def likelihood(parameters: torch.Tensor) -> torch.Tensor:
+    def likelihood(parameters: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         model = system(MaskModel(*parameters), propagated=False)
-        return filter_sequence(model, *given).log_likelihood
+        return filter_sequence(replace(model, emission_cov=noise), *given).log_likelihood
 
+    noise = torch.tensor([0.04, 0.3], **DOUBLE, requires_grad=True)
     for slope in (-2.0, 1e-3):
         start = torch.tensor([[0.3, 0.1], [slope, 2 * slope]], **DOUBLE, requires_grad=True)
-        assert torch.autograd.gradcheck(likelihood, start)
+        assert torch.autograd.gradcheck(likelihood, (start, noise))
     start = torch.zeros(2, 2, **DOUBLE, requires_grad=True)
-    (gradient,) = torch.autograd.grad(likelihood(start).sum(), start)
+    (gradient,) = torch.autograd.grad(likelihood(start, noise).sum(), start)
     assert bool(gradient.isfinite().all())
     assert bool((gradient != 0).any())
 

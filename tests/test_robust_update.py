@@ -1,10 +1,9 @@
 """The robust update: weights of readings, from leave-one-out scores to an exported policy.
 
-Specified here, in float64: a weight w is a noise variance r / w in every form of the filter, in
-values, covariances and gradients; the weights are those of a textbook loop that conditions each
-reading on the others; how far off one reading is makes no difference beyond a bound that is stated;
+Specified here, in float64: the weights are those of a textbook loop that conditions each reading on
+the others; how far off one reading is makes no difference beyond a bound that is stated;
 correlated sensors, half of them wrong, one alone; acting, sequences, loss and export agree. The
-command line: test_evaluate.py.
+command line: test_evaluate.py; a weight as a noise variance: test_functional_filtering.py.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from typing import Any, get_args
 import oracles
 import pytest
 import torch
-from filter_problems import SIZES, Problem, assert_same
 from small_agents import make_agent, make_filter
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -136,43 +134,6 @@ def textbook(
     return tuple(torch.stack(x).unflatten(0, resets.shape) for x in out)
 
 
-# Weights in the filter ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("propagated", [False, True])
-@pytest.mark.parametrize("full_noise", [False, True])
-@pytest.mark.parametrize("form", ["auto", "step by step"])
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_a_weight_is_a_variance_in_values_and_all_gradients(
-    state, obs, form, full_noise, propagated
-):
-    options = {"full_noise": full_noise, "propagated": propagated}
-    problem = Problem(state, obs, stored=True, weighted=True, **options)
-    assert_same(problem, problem.library(form), problem.oracle())
-
-
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_weights_of_one_change_no_bit_and_of_zero_are_missing_entries(state, obs):
-    problem = Problem(state, obs)
-    weight = torch.ones(problem.observed.shape, dtype=torch.float64)
-    plain, ones = (problem.run("pytorch", weight=w, return_cov=True) for w in (None, weight))
-    for a, b in zip(plain, ones, strict=True):
-        assert torch.equal(a, b)
-    gone = problem.run("pytorch", weight=0 * weight)
-    problem.observed = torch.zeros_like(problem.observed)
-    assert torch.equal(gone.mean, problem.run("pytorch").mean)
-    assert not gone.log_likelihood.any()
-
-
-@pytest.mark.parametrize("value", [-0.1, 1.5])
-def test_weights_outside_0_and_1_are_one_line(value: float) -> None:
-    problem = Problem(4, 4)
-    weight = torch.full(problem.observed.shape, value, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"`weight` must lie in \[0, 1\], got") as caught:
-        problem.run("auto", weight=weight)
-    assert "\n" not in str(caught.value)
-
-
 # What the weights are -------------------------------------------------------------------------
 
 
@@ -204,7 +165,9 @@ def test_readings_within_the_threshold_are_believed_to_the_bit(kind: str) -> Non
     model, plain = make(kind, robust="huber", robust_threshold=1e3), make(kind)
     mean, *rest = inputs(model, wrong=0.0)
     options = {"cov": before(model), "robust": "huber", "threshold": 1e3}
-    assert (robust_weights(model.state_space(), *first((mean, *rest)), **options) == 1).all()
+    weights = robust_weights(model.state_space(), *first((mean, *rest)), **options)
+    assert (weights == 1).all()
+    assert not weights.requires_grad
     outs = (m(mean, before(m), *rest, return_cov=True) for m in (model, plain))
     for a, b in zip(*outs, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
@@ -320,7 +283,7 @@ def test_one_step_at_a_time_a_module_writes_what_it_writes_of_the_sequence(kind,
     data = frames(inputs(model), before(model)).clone()
     joint = torch.zeros(BATCH, TIME, dtype=torch.bool)
     joint[3, 2] = True  # two slices in one row: the second starts from what is stored
-    for name in data["recurrent"].exclude("age").keys():
+    for name in set(data["recurrent"].keys()) - {"age"}:
         data["recurrent", name][3, 2] += 1.5 * data["recurrent", name][0, 0]
     module = BeliefFilterModule(model, policy_input="mean_cov")
     with set_recurrent_mode(True):

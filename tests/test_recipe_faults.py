@@ -1,0 +1,130 @@
+"""What goes wrong inside a run: numbers that are none, an environment that fails.
+
+It ends in one line that says at which step, and what was saved is good.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from ppo_drbpn import train_rollout
+from recipe_tools import (
+    SMOKE,
+    assembled,
+    read_table,
+    resume,
+    run,
+)
+from training.checkpoint import last_checkpoint, load_checkpoint
+from training.errors import DivergedError, UserError
+
+
+@pytest.mark.parametrize("belief", ["drbpn", "gru", "none"])
+def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(
+    tmp_path: Path, belief: str
+) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(
+        UserError, match=r"training stopped at 0 steps: .*(nan|inf|no longer finite)"
+    ) as error:
+        run(folder, *SMOKE, f"belief={belief}", "optim.lr=1e30")
+    assert "\n" not in str(error.value)
+    assert "checkpoint" not in str(error.value)
+    assert not list(folder.rglob("*.pt"))
+    assert not read_table(folder / "evaluation.csv")
+
+
+def test_a_run_that_diverges_later_names_its_last_good_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import ppo_drbpn
+
+    collect = ppo_drbpn.collect
+
+    def spoilt(training: Any) -> Any:
+        if training.frames == 256:
+            with torch.no_grad():
+                next(training.agent.critic.parameters())[0] = torch.inf
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", spoilt)
+    folder = tmp_path / "run"
+    kept = rf"at 256 steps: .* Its last checkpoint, at 256 steps, is in {re.escape(str(folder))}"
+    with pytest.raises(UserError, match=kept):
+        run(folder, *SMOKE, "checkpoint.every_frames=128")
+    assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
+    assert "final" not in (folder / "evaluation.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        ("reward", "training stopped at 256 steps: the reward of environment 2 is not finite"),
+        ("observation", "training stopped at 256 steps: the observation of environment 2 is not"),
+        ("raise", "training stopped at 256 steps: the environment failed: motor on fire"),
+    ],
+)
+def test_a_fault_of_the_environment_ends_in_one_line_and_a_saved_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, line: str
+) -> None:
+    import ppo_drbpn
+
+    collect, calls = ppo_drbpn.collect, []
+
+    def faulty(training: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 4:  # the first gives statistics alone
+            rollout = training.collector.rollout
+
+            def broken() -> Any:
+                if fault == "raise":
+                    raise RuntimeError("motor\non fire")
+                data = rollout()
+                data["next", fault][2, 5] = torch.nan
+                data["next", "observed"][2, 5] = True
+                return data
+
+            monkeypatch.setattr(training.collector, "rollout", broken)
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", faulty)
+    folder = tmp_path / "run"
+    with pytest.raises(UserError, match=line):
+        run(folder, *SMOKE, "checkpoint.every_frames=10000")
+    assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
+    monkeypatch.undo()
+    assert resume(folder) == 0  # with new episodes
+    assert len(read_table(folder / "metrics.csv")) == 4
+
+
+def test_an_engine_that_resets_itself_is_counted_and_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import ppo_drbpn
+
+    collect = ppo_drbpn.collect
+
+    def wild(training: Any) -> Any:
+        if 0 < training.frames < 384:
+            training.env.base_env.envs[1].unwrapped.data.qvel[0] = 1e12
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", wild)
+    assert run(tmp_path / "run", *SMOKE) == 0
+    rows = read_table(tmp_path / "run" / "metrics.csv")
+    assert [row["engine_resets"] for row in rows] == ["0", "1", "2", "2"]
+    printed = "".join(capsys.readouterr())
+    assert printed.count("reset it") == 1
+    assert "Warning" not in printed
+
+
+def test_a_weight_that_is_none_is_named() -> None:
+    training, config = assembled(*SMOKE)
+    with torch.no_grad():
+        training.agent.critic.module[0].bias[3] = torch.inf
+    with pytest.raises(DivergedError, match=r"the (loss|weight|gradient) `.*` is (nan|inf)"):
+        train_rollout(training, config)
