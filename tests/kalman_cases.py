@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief
 
-TOLERANCE = 1e-10
 # state smaller than, equal to and larger than obs
 SIZES = [
     pytest.param(3, 5, id="state<obs"),
@@ -19,10 +18,6 @@ SIZES = [
 SEEDS = [0, 1, 2]
 # what arrives: one entry, all, some, none
 PATTERNS = ["one", "all", "some", "none"]
-
-
-def assert_equal(actual: Tensor, expected: Tensor, tolerance: float = TOLERANCE) -> None:
-    torch.testing.assert_close(actual, expected, atol=tolerance, rtol=tolerance)
 
 
 def pattern(kind: str, obs: int, generator: torch.Generator) -> Tensor:

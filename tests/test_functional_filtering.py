@@ -13,6 +13,10 @@ from torch import Tensor
 
 from torchrl_drbpn.functional import filter_sequence, filter_step, filtered_cov
 
+covariances = pytest.mark.parametrize(
+    "propagated", [False, True], ids=["constant covariance", "propagated"]
+)
+
 
 @pytest.mark.parametrize(
     "events",
@@ -23,13 +27,23 @@ from torchrl_drbpn.functional import filter_sequence, filter_step, filtered_cov
     ],
 )
 @pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
+@covariances
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("state", "obs"), SIZES)
 def test_every_form_equals_the_oracle_in_values_and_all_gradients(
-    state, obs, form, full_noise, events
+    state, obs, form, propagated, full_noise, events
 ):
-    problem = Problem(state, obs, full_noise=full_noise, **events)
-    assert_same(problem, problem.library(form), problem.oracle())
+    problem = Problem(state, obs, full_noise=full_noise, propagated=propagated, **events)
+    if form == "native" and full_noise and propagated:
+        with pytest.raises(ValueError, match="diagonal"):
+            problem.library(form)
+        return
+    truth = problem.oracle()
+    assert_same(problem, problem.library(form), truth)
+    if propagated:  # not asked for, it is there all the same: it is the state, without a gradient
+        cov = problem.run(form, **problem.stored()).cov
+        assert not cov.requires_grad
+        assert_equal(cov, truth[1])
 
 
 @pytest.mark.parametrize(
@@ -100,16 +114,16 @@ def test_a_diagonal_covariance_equals_its_variances(state, obs):
     assert_same(problem, tuple(a), tuple(b))
 
 
+@covariances
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_stepping_through_time_equals_the_whole_sequence(state, obs, form):
-    problem = Problem(state, obs)
-    mean, *rest = problem.arguments()
-    rows = []
+def test_stepping_through_time_equals_the_whole_sequence(state, obs, form, propagated):
+    problem = Problem(state, obs, propagated=propagated)
+    (mean, *rest), before, rows = problem.arguments(), {}, []
     for t in range(problem.reset.shape[1]):
         step = (mean, *(x[:, t] for x in rest))
-        rows.append(problem.run(form, *step, function=filter_step, return_cov=True))
-        mean = rows[-1].mean
+        rows.append(problem.run(form, *step, function=filter_step, return_cov=True, **before))
+        mean, before = rows[-1].mean, {"cov": rows[-1].cov} if propagated else {}
     stepped = tuple(torch.stack(part, 1) for part in zip(*rows, strict=True))
     assert_same(problem, stepped, problem.library(form))
 

@@ -10,7 +10,8 @@ import math
 import oracles
 import pytest
 import torch
-from kalman_cases import PATTERNS, SEEDS, SIZES, assert_equal, case, given, pattern
+from filter_problems import assert_equal
+from kalman_cases import PATTERNS, SEEDS, SIZES, case, given, pattern
 from torch import Tensor
 
 from torchrl_drbpn import functional as F

@@ -106,8 +106,8 @@ def test_sac_learns_from_corrupted_observations(missing):
     data = torch.cat(rollouts, 1)
     assert data.shape == (ENVS, BATCHES * FRAMES // ENVS)
     assert data["next", "done"].any()
-    missing = 1 - data["observed"].float().mean((0, 1))
-    assert (missing - 0.3).abs().max() < 0.1
+    gaps = 1 - data["observed"].float().mean((0, 1))
+    assert (gaps - 0.3).abs().max() < 0.1
     if missing == "keep":
         check_filled(data)
 

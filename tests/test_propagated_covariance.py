@@ -2,13 +2,14 @@
 
 Specified here:
 
-- every form equals the row-deleting oracle whose covariance before is a constant of autograd, in
-  values and all gradients, to 1e-10; a sequence equals its steps; a NaN before a reset is harmless;
+- a NaN before a reset is harmless; while nothing arrives the covariance grows (that every form is
+  the oracle and a sequence its steps: test_functional_filtering.py);
 - on a linear system the likelihood of a row is that of one joint Gaussian;
 - float32 stays positive definite over 10,000 steps, under a transition that expands too;
 - the closed-form Jacobian is autograd's, for every network, of each row and on average;
 - a filter computes it at its first call, then only where asked; it is saved with the filter;
-- the covariance is part of the recurrent state, and its absence is named.
+- the covariance is part of the recurrent state, and its absence is named (that steps are the
+  sequence through the module: test_belief_filter_module.py).
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from __future__ import annotations
 import oracles
 import pytest
 import torch
-from filter_problems import FORMS, SIZES, TOLERANCE, Problem, assert_equal, assert_same
+from belief_frames import BeliefFrames
+from filter_problems import FORMS, SIZES, TOLERANCE, Problem, assert_equal
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
@@ -31,45 +33,7 @@ from torchrl_drbpn.functional import (
     filtered_cov,
 )
 
-EVENTS = [
-    pytest.param({"resets": False}, id="one episode"),
-    pytest.param({"resets": True, "stored": True}, id="resets and stored states"),
-]
-
-
 # --- the filter -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("events", EVENTS)
-@pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_every_form_equals_the_oracle_in_values_and_all_gradients(
-    state, obs, form, full_noise, events
-):
-    if form == "native" and full_noise:
-        pytest.skip("it takes a diagonal R")
-    problem = Problem(state, obs, full_noise=full_noise, propagated=True, **events)
-    assert_same(problem, problem.library(form), problem.oracle())
-    # Not asked for, the covariance is there all the same: it is the state. It has no gradient.
-    out = problem.run(form, **problem.stored())
-    assert not out.cov.requires_grad
-    assert_equal(out.cov, problem.oracle()[1])
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_stepping_through_time_equals_the_whole_sequence(state, obs, form):
-    problem = Problem(state, obs, propagated=True)
-    whole = problem.library(form)
-    (mean, *rest), cov, rows = problem.arguments(), problem.start_cov, []
-    for t in range(problem.reset.shape[1]):
-        step = (mean, *(x[:, t] for x in rest))
-        out = problem.run(form, *step, function=filter_step, cov=cov, return_cov=True)
-        mean, cov = out.mean, out.cov
-        rows.append(out)
-    stepped = tuple(torch.stack(part, 1) for part in zip(*rows, strict=True))
-    assert_same(problem, stepped, whole)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -268,32 +232,9 @@ def test_the_covariance_is_part_of_the_recurrent_state():
     assert ("next", "recurrent", "cov") in module.out_keys
     primer = module.make_tensordict_primer()
     assert primer.primers["recurrent", "cov"].shape == (3, 3)
-    action, x, seen, reset = inputs()
-    none = torch.zeros(4, 3)
-    state = TensorDict({"mean": none, "cov": none.unsqueeze(-1) * none.unsqueeze(-2)}, [4])
-    state["age"] = torch.zeros(4, 1).long()
-    steps = []
-    for t in range(6):
-        state["age"][reset[:, t]] = 0  # as the primer does
-        step = TensorDict(
-            {
-                "previous_action": action[:, t], "observation": x[:, t], "observed": seen[:, t],
-                "is_init": reset[:, t, None], "recurrent": state,
-            },
-            [4],
-        )  # fmt: skip
-        steps.append(module(step))
-        state = steps[-1]["next", "recurrent"].clone()
-    data = torch.stack(steps, 1)
-    data["is_init"][2, 4] = True  # where two slices were joined: the stored belief is taken
-    data["recurrent", "cov"][2, 4] *= 2
-    with set_recurrent_mode(True):
-        out = module(data.clone())
-    for key in (("belief", "log_likelihood"), "features", ("next", "recurrent", "cov")):
-        torch.testing.assert_close(out[key][:2], data[key][:2], atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(out[key][2, :4], data[key][2, :4], atol=1e-5, rtol=1e-5)
-    assert not torch.allclose(out["features"][2, 4], data["features"][2, 4])
-    del data["recurrent", "cov"]
+    frames = BeliefFrames().make_frames((4,))
+    frames["recurrent"] = TensorDict({"mean": torch.zeros(4, 3), "age": torch.ones(4, 1).long()})
+    frames = frames.auto_batch_size_(1)
     for mode in (False, True):
         with set_recurrent_mode(mode), pytest.raises(KeyError, match=r"recurrent', 'cov'.*not in"):
-            module(data)
+            module(frames.unsqueeze(1) if mode else frames)
