@@ -31,7 +31,10 @@ def with_state(frames: TensorDict, state: int) -> TensorDict:
     shape, dtype = frames.shape, frames["observation"].dtype
     mean = torch.randn(*shape, state, generator=g, dtype=dtype)
     age = torch.full((*shape, 1), 3)
-    return frames.clone().set("recurrent", TensorDict({"mean": mean, "age": age}, shape))
+    root = torch.randn(*shape, state, state, generator=g, dtype=dtype)
+    cov = root @ root.mT + torch.eye(state)  # read where it is propagated
+    recurrent = TensorDict({"mean": mean, "age": age, "cov": cov}, shape)
+    return frames.clone().set("recurrent", recurrent)
 
 
 class TestContract(BeliefModuleContract):
@@ -128,10 +131,11 @@ def test_out_keys_as_a_list_or_a_dict_choose_what_is_written_and_computed(monkey
 
 @pytest.mark.parametrize("over_time", [False, True])
 @pytest.mark.parametrize(
-    ("state", "cov_network"), [(OBS, False), (3, False), (7, False), (3, True)]
+    ("state", "options"),
+    [(OBS, {}), (3, {}), (7, {}), (3, {"cov_network": True}), (3, {"covariance": "propagated"})],
 )
-def test_optional_entries_equal_the_textbook(state, cov_network, over_time):
-    model = make_filter(dtype=torch.float64, state=state, cov_network=cov_network)
+def test_optional_entries_equal_the_textbook(state, options, over_time):
+    model = make_filter(dtype=torch.float64, state=state, **options)
     module = BeliefFilterModule(model, out_keys=["features", ("belief", "mean"), *OPTIONAL])
     data = with_state(make_frames((3, 6)), state)
     data["is_init"][1, 2] = True
@@ -143,20 +147,23 @@ def test_optional_entries_equal_the_textbook(state, cov_network, over_time):
     emission = model.emission
     H, R = emission.matrix, emission.cov()
     for b in range(3):
-        mean = data["recurrent", "mean"][b, 0]
+        mean, cov = data["recurrent", "mean"][b, 0], data["recurrent", "cov"][b, 0]
         for t in range(6):
             first = bool(data["is_init"][b, t])
             if first or not over_time:
-                mean = data["recurrent", "mean"][b, t]
+                mean, cov = data["recurrent", "mean"][b, t], data["recurrent", "cov"][b, t]
             action = data["previous_action"][b, t]
             moved = model.transition(mean, action)
+            if model.covariance == "propagated":
+                F = model.mean_jacobian
+                moved = functional.Belief(moved.mean, F @ cov @ F.mT + moved.cov)
             if first and (data["recurrent", "age"][b, t] == 0 or not over_time):
                 moved = functional.Belief(model.initial_mean, model.initial_cov)
             offset = emission.action_matrix @ action + emission.offset
             args = (data["observation"][b, t], data["observed"][b, t], H, R, offset)
             filtered = functional.update(moved, *args)
             _, S = functional.innovation(moved, *args)
-            mean = filtered.mean
+            mean, cov = filtered
             for key, expected in (
                 (("belief", "mean"), filtered.mean),
                 (("belief", "cov"), filtered.cov),

@@ -63,7 +63,8 @@ def test_a_run_on_two_nodes_learns_and_a_dead_worker_ends_it_saved(
         row, _ = train_rollout(training, config)
     assert row["frames"] == 256
     # The weights are sent before a rollout, so these are as old as the last update of the norm.
-    training.collector.rollout()
+    first, second = training.collector.rollout()["observation"].chunk(2)
+    assert (first != second).any(-1).all()  # each worker has episodes of its own
     workers = training.collector._collector
     wanted = training.agent.policy.state_dict()
     statistics = {value.data_ptr() for value in training.agent.norm.state_dict().values()}
