@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from contract_environments import StaircaseEnv
+from contract_environments import ACTION, OBS, StaircaseEnv
+from ppo_drbpn import train_rollout
+from recipe_tools import SMOKE, assembled, make_config, read_table, resume, run
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded
 from torchrl.envs import GymEnv, TransformedEnv
-
-pytest.importorskip("hydra")
-from recipe_tools import SMOKE, make_config  # isort: skip
 from training.envs import make_env, make_torchrl_env
 from training.errors import UserError
 
@@ -54,3 +56,46 @@ def test_what_can_not_be_trained_is_one_line(
 def test_a_mask_that_the_environment_does_not_write_is_named() -> None:
     with pytest.raises(UserError, match=r"mask is to be read, .* writes observation"):
         make_env(make_config(*SMOKE, "missingness=from_mask"))
+
+
+class MaskingEnv(StaircaseEnv):
+    """Component i arrives at the steps that i + 1 divides; elsewhere a number that is none."""
+
+    def __init__(self, batch: int) -> None:
+        super().__init__(batch, horizon=7)
+        spec = self.observation_spec.clone()
+        spec["mask"] = Binary(shape=(batch, OBS), dtype=torch.bool)
+        self.observation_spec = spec
+        self.action_spec = Bounded(-1.0, 1.0, shape=(batch, ACTION), dtype=torch.float32)
+
+    def _observe(self) -> TensorDict:
+        data = super()._observe()
+        data["mask"] = self.time[:, None] % torch.arange(1, OBS + 1) == 0
+        return data.set("observation", data["observation"].where(data["mask"], -9e3))
+
+
+def test_an_environment_trains_and_resumes_by_its_target(tmp_path: Path) -> None:
+    make = ["env.make._target_=torchrl.envs.GymEnv", "+env.make.env_name=Pendulum-v1"]
+    words = [*SMOKE, "env=torchrl", "env.id=pendulum", *make]
+    run(tmp_path / "run", *words, "total_frames=128")
+    resume(tmp_path / "run", "total_frames=256")
+    (row, *_) = read_table(tmp_path / "run" / "metrics.csv")
+    assert row["missing_ratio"]
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.5])
+def test_the_mask_that_an_environment_writes_says_what_arrived(eta: float) -> None:
+    words = (f"env.make._target_={__name__}.MaskingEnv", "+env.make.batch=4", "env.id=staircase")
+    more = ("env=torchrl", "missingness=from_mask", f"missingness.eta={eta}", "noise=none")
+    training, config = assembled("experiment=smoke", "collector.num_envs=4", *more, *words)
+    row, _ = train_rollout(training, config)
+    assert torch.tensor([v for v in row.values() if v is not None]).isfinite().all()
+    data = training.collector.rollout()
+    for frame, time in ((data, data["step_count"]), (data["next"], data["next", "step_count"])):
+        arrived = time % torch.arange(1, OBS + 1) == 0
+        assert frame["observed"].any()
+        assert not (frame["observed"] & ~arrived).any()
+        assert torch.equal(frame["observed"], arrived) is (eta == 0)
+        assert not frame["observation"][~frame["observed"]].any()
+    assert data["normalized_observation"].isfinite().all()
+    assert row["missing_ratio"] > 0.4
