@@ -14,8 +14,6 @@ from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import check_observed, masked_cov, zero_missing
 
-__all__ = ["Consistency", "chi_square_quantile", "consistency", "nees", "nis"]
-
 _BISECTIONS = 100  # halve an interval until float64 has no number between its ends
 
 
@@ -29,20 +27,17 @@ def nis(innovation: Tensor, innovation_cov: Tensor, observed: Tensor) -> Tensor:
     Smaller: not sure enough.
 
     Args:
-        innovation: v, shape ``(*batch, obs)``; what stands at missing entries is ignored.
-        innovation_cov: S, shape ``(*batch, obs, obs)`` or ``(obs, obs)``, over all entries.
+        innovation: v of :func:`innovation`, shape ``(*batch, obs)``.
+        innovation_cov: S over all entries, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
         observed: bool M, shape ``(*batch, obs)``, True = counts; a ValueError for another.
 
     Returns:
-        Shape ``(*batch,)``, no unit, exactly 0 where nothing was observed. Float64 whatever the
-        inputs: an innovation covariance is as ill-conditioned as signal over noise.
+        Shape ``(*batch,)``, no unit, float64; exactly 0 where nothing was observed.
 
     Example:
         >>> v, S = torch.tensor([3.0, float("nan")]), torch.diag(torch.tensor([9.0, 1.0]))
         >>> nis(v, S, torch.tensor([True, False])).item()
         1.0
-
-    See also :func:`innovation`, which returns v and S.
     """
     check_observed(innovation, observed)
     return nees(zero_missing(innovation, observed), masked_cov(innovation_cov, observed))
@@ -54,14 +49,8 @@ def nees(error: Tensor, cov: Tensor) -> Tensor:
     .. math:: \epsilon = e' P^{-1} e
 
     §5.4 [Bar-Shalom 2001]. If the belief is right it is chi-square distributed with the dimension
-    of the state for its degrees of freedom, which is then its mean.
-
-    Args:
-        error: e, truth minus estimate, shape ``(*batch, state)``.
-        cov: P, shape ``(*batch, state, state)`` or ``(state, state)``.
-
-    Returns:
-        Shape ``(*batch,)``, no unit, float64.
+    of the state as degrees of freedom. Of e, truth minus estimate, ``(*batch, state)``, and P,
+    ``(*batch, state, state)`` or ``(state, state)``; ``(*batch,)``, no unit, float64.
 
     Example:
         >>> nees(torch.tensor([3.0, 2.0]), torch.diag(torch.tensor([9.0, 4.0]))).item()
@@ -77,8 +66,8 @@ def chi_square_quantile(probability: Tensor | float, dof: Tensor | float) -> Ten
 
     .. math:: x: \; \gamma(k/2, x/2) / \Gamma(k/2) = p
 
-    By bisection of ``torch.special.gammainc``, to the last bits of float64. ``probability`` p in
-    [0, 1) and ``dof`` k > 0 broadcast; a ValueError for others.
+    To the last bits of float64. ``probability`` p in [0, 1) and ``dof`` k > 0 broadcast; a
+    ValueError for others.
 
     Example:
         >>> round(chi_square_quantile(0.95, 2).item(), 6)  # -2 log(1 - p)
@@ -101,13 +90,7 @@ def chi_square_quantile(probability: Tensor | float, dof: Tensor | float) -> Ten
 
 
 class Consistency(NamedTuple):
-    """Hold the outcome of a consistency test.
-
-    Args:
-        ratio: sum of the normalised squares over the sum of their degrees of freedom; 1 expected.
-        lower: of the band in which it lies with the probability asked for, if the belief is right.
-        upper: of that band.
-    """
+    """Hold a ratio, 1 expected, and the band in which it lies with the probability asked for."""
 
     ratio: Tensor
     lower: Tensor
@@ -120,17 +103,17 @@ def consistency(
     r"""Test normalised squares against the chi-square distribution: is the filter consistent?
 
     .. math::
-        \frac{\sum_t \epsilon_t}{\sum_t n_t}, \qquad
+        \frac{\sum_t \epsilon_t}{N}, \qquad
         \left[ \frac{\chi^2_{N}(\alpha / 2)}{N}, \frac{\chi^2_{N}(1 - \alpha / 2)}{N} \right],
         \quad N = \sum_t n_t
 
-    The time-average test of §5.4.2 [Bar-Shalom 2001], each step with as many degrees of freedom
-    as entries were observed in it. The band holds for independent terms: the innovations of a
-    right filter are, the NEES of successive steps is not (average it over runs at one step).
+    The time-average test of §5.4.2 [Bar-Shalom 2001]. The band holds for independent terms: the
+    innovations of a right filter are, the NEES of successive steps is not (average it over runs at
+    one step).
 
     Args:
         squared: :func:`nis` or :func:`nees` of every step.
-        dof: entries of every step, the same shape; what stands at steps with none is ignored.
+        dof: n, the entries of every step, the same shape; steps with none do not count.
         probability: of the two-sided band, 1 - alpha, in (0, 1).
         dim: dimension that is summed over; None: all of them.
 

@@ -1,10 +1,8 @@
 """A whole sequence through the belief filter, and one step of it.
 
-Two forms give the same numbers: :mod:`.pytorch_form`, plain autograd on any device and under every
-transformation, and :mod:`.native`, one operator on the CPU; :func:`.unsupported_reason` is the rule
-which runs. Where Q is constant, predicted covariances depend on the episode starts alone; where
-they are propagated by one Jacobian, on masks too: in both they are known ahead of the means. A Q or
-a Jacobian that depends on the state, or a model of the mask, is filtered step by step.
+:func:`.unsupported_reason` is the rule which of two forms runs, :mod:`.native` or
+:mod:`.pytorch_form`; they give the same numbers. A Q or a Jacobian that depends on the state, or a
+model of the mask, is filtered step by step.
 """
 
 from __future__ import annotations
@@ -27,8 +25,6 @@ from torchrl_drbpn.functional.pytorch_form import (
 )
 from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, propagate
 
-__all__ = ["FilterOutput", "filter_sequence", "filter_step", "filtered_cov"]
-
 Form = Literal["auto", "pytorch", "native"]
 
 
@@ -40,12 +36,6 @@ class FilterOutput(NamedTuple):
         cov: filtered covariance, shape ``(*batch, [time,] state, state)``. Where it is propagated
             it is always there, without gradient unless asked for; else None where not asked for.
         log_likelihood: of each step, shape ``(*batch, [time])``, nats.
-
-    Example:
-        >>> import torch
-        >>> out = FilterOutput(torch.zeros(2), None, torch.zeros(()))
-        >>> out.cov is None
-        True
     """
 
     mean: Tensor
@@ -72,16 +62,14 @@ def filter_step(
     :func:`filter_sequence`, without the dimension of time.
 
     Example:
-        >>> import torch
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(
-        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...     torch.zeros(2), eye)
-        >>> nothing = torch.zeros(5, 2, dtype=torch.bool)
-        >>> out = filter_step(model, torch.ones(5, 2), torch.zeros(5, 1), torch.zeros(5, 2),
-        ...                   nothing, torch.zeros(5, dtype=torch.bool))
-        >>> bool((out.mean == 1).all()), bool((out.log_likelihood == 0).all())
-        (True, True)
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model, mean = BeliefFilter(obs_dim=2, action_dim=1).state_space(), torch.ones(5, 2)
+        >>> action, nothing = torch.zeros(5, 1), torch.zeros(5, 2, dtype=torch.bool)
+        >>> out = filter_step(model, mean, action, mean, nothing, nothing[:, 0])
+        >>> torch.allclose(out.mean, model.transition(mean, action), atol=1e-5)
+        True
+        >>> bool((out.log_likelihood == 0).all())
+        True
     """
     given = FilterInputs(
         observation, observed, previous_action, reset, None, None, mean, None, cov, weight
@@ -124,7 +112,7 @@ def filter_sequence(
         mean: filtered mean of the step before the first, shape ``(*batch, state)``.
         previous_action: shape ``(*batch, time, action)``.
         observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, time, obs)``.
+        observed: bool, shape ``(*batch, time, obs)``, True = arrived.
         reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
 
     Keyword Args:
@@ -132,7 +120,7 @@ def filter_sequence(
             needed, and read, where the model propagates it.
         use_stored_state: bool, shape ``(*batch, time)``; True takes the belief of the step before
             from ``stored_mean`` (and ``stored_cov``) instead of from the sequence.
-        stored_mean: shape ``(*batch, time, state)``; read where ``use_stored_state`` is True.
+        stored_mean: shape ``(*batch, time, state)``, needed beside ``use_stored_state``.
         stored_cov: shape ``(*batch, time, state, state)``; as ``cov``.
         weight: w in [0, 1], shape ``(*batch, time, obs)``: reading i has the variance r_i / w_i
             on the diagonal of R; 0 is missing. It gets no gradient.
@@ -143,22 +131,16 @@ def filter_sequence(
         :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
 
     Raises:
-        ValueError: for a wrong shape or dtype, a weight outside [0, 1], a propagated covariance
-            that is missing, if form="native" cannot run, or one of ``use_stored_state`` and
-            ``stored_mean`` is given without the other.
+        ValueError: for a wrong shape or dtype, a weight outside [0, 1], a belief that is not whole,
+            or form="native" where it cannot run.
 
     Example:
-        >>> import torch
-        >>> from torchrl_drbpn.functional import TransitionMLP
-        >>> f = TransitionMLP((torch.zeros(2, 3),), (torch.zeros(2),), True, "relu")
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(f, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...                    torch.zeros(2), eye)
-        >>> seen = torch.rand(4, 10, 2) < 0.7
-        >>> out = filter_sequence(model, torch.zeros(4, 2), torch.zeros(4, 10, 1),
-        ...                       torch.randn(4, 10, 2), seen, torch.zeros(4, 10, dtype=torch.bool))
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model = BeliefFilter(obs_dim=2, action_dim=1).state_space()
+        >>> x, seen, reset = torch.randn(4, 9, 2), torch.rand(4, 9, 2) < 0.7, torch.zeros(4, 9) > 0
+        >>> out = filter_sequence(model, torch.zeros(4, 2), torch.zeros(4, 9, 1), x, seen, reset)
         >>> out.mean.shape, out.log_likelihood.shape
-        (torch.Size([4, 10, 2]), torch.Size([4, 10]))
+        (torch.Size([4, 9, 2]), torch.Size([4, 9]))
     """
     if (use_stored_state is None) != (stored_mean is None):
         raise ValueError(
@@ -227,34 +209,20 @@ def _warn_once(reason: str) -> None:
 def filtered_cov(
     model: StateSpace, observed: Tensor, reset: Tensor, weight: Tensor | None = None
 ) -> Tensor:
-    r"""Return the filtered covariance of a constant-Q model: of the masks and weights alone.
+    """Return the filtered covariance of a constant-Q model: of the masks and weights alone.
 
     .. math:: P^+ = (I - K H) P (I - K H)' + K R K'
 
-    Eq. (10) [DRBPN] in Joseph's form; P is Q, or P_0 where an episode starts.
-
-    Args:
-        model: the state-space model, its transition_cov a tensor.
-        observed: bool, shape ``(*batch, obs)``.
-        reset: bool, shape ``(*batch,)``.
-        weight: in (0, 1], shape ``(*batch, obs)``, see :func:`filter_sequence`.
-
-    Returns:
-        Shape ``(*batch, state, state)``, symmetric positive definite.
-
-    Raises:
-        ValueError: if transition_cov depends on the state.
+    Eq. (10) [DRBPN] in Joseph's form; P is Q, or P_0 where ``reset``, bool ``(*batch,)``, is True.
+    ``observed`` and ``weight`` are those of :func:`filter_sequence`, ``(*batch, obs)``; a
+    ValueError if the model's covariance depends on the past. Shape ``(*batch, state, state)``.
 
     Example:
-        >>> import torch
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(
-        ...     lambda m, a: m, eye, eye, 3 * torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...     torch.zeros(2), eye)
-        >>> seen = torch.tensor([True, False])
-        >>> cov = filtered_cov(model, seen, torch.tensor(False))
-        >>> torch.allclose(cov, torch.diag(torch.tensor([0.75, 1.0])))
-        True
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model = BeliefFilter(obs_dim=2, action_dim=1).state_space()
+        >>> cov = filtered_cov(model, torch.tensor([True, False]), torch.tensor(False))
+        >>> (cov < model.constant_cov()).diagonal().tolist()
+        [True, False]
     """
     if model.transition_jacobian is not None or model.mask_model is not None:
         raise ValueError(

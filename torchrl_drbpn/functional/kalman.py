@@ -1,10 +1,9 @@
 """One time step of the masked Kalman filter in textbook form: predict, innovation, update.
 
-These functions are the truth to which the fast sequence filter (:mod:`.filtering`) is held. They
-take any mask and any leading batch shape; nothing is inverted explicitly. Inside a function the
-book's letters stand for: m, P the belief, H the emission matrix, R the emission covariance,
-S the innovation covariance, K the gain. A covariance is a matrix or, of shape ``(n,)``, the
-variances of a diagonal one.
+The fast sequence filter (:mod:`.filtering`) is held to these functions. They take any mask and any
+leading batch shape. The book's letters stand for: m, P the belief, H the emission matrix, R the
+emission covariance, S the innovation covariance, K the gain. A covariance is a matrix or, of shape
+``(n,)``, the variances of a diagonal one.
 """
 
 from __future__ import annotations
@@ -28,16 +27,6 @@ from torchrl_drbpn.functional.gaussian import (
     zero_missing,
 )
 
-__all__ = [
-    "MaskModel",
-    "innovation",
-    "log_likelihood",
-    "predict",
-    "sequential_update",
-    "update",
-    "update_by_mask",
-]
-
 _SCALE = math.sqrt(math.pi / 8)  # makes the normal distribution function a logistic one
 _LEAST_INFORMATION = 1e-12
 
@@ -53,10 +42,6 @@ class MaskModel(NamedTuple):
     Args:
         intercept: a, shape ``(obs,)``.
         slope: b, shape ``(obs,)``, one over the units of an observation; 0 is ignorable.
-
-    Example:
-        >>> MaskModel._fields
-        ('intercept', 'slope')
     """
 
     intercept: Tensor
@@ -77,7 +62,7 @@ def predict(
 
     Eq. (8) [DRBPN] takes the transition at the mean only, so that :math:`P^- = Q`. With
     ``jacobian`` the covariance is propagated, as in the extended Kalman filter (§5.2 [Särkkä
-    2013]).
+    2013]). A Q that was trained without it holds the past's share already.
 
     Args:
         belief: filtered belief of the step before, mean ``(*batch, state)``.
@@ -86,16 +71,13 @@ def predict(
         previous_action: shape ``(*batch, action)``.
 
     Keyword Args:
-        jacobian: J, the derivative of f by the mean, shape ``(*batch, state, state)``, to propagate
-            the covariance; None for the constant one of the paper, which drops the past. A Q that
-            was trained without it holds the past's share already: propagating it afterwards would
-            count that twice.
+        jacobian: J, the derivative of f by the mean, shape ``(*batch, state, state)``; None for the
+            constant covariance of the paper, which drops the past.
 
     Returns:
         The predicted belief.
 
     Example:
-        >>> import torch
         >>> belief = Belief(torch.ones(5, 2), torch.eye(2).expand(5, 2, 2))
         >>> predicted = predict(
         ...     belief, lambda m, a: m + a, 0.1 * torch.eye(2), torch.ones(5, 2), jacobian=None)
@@ -113,11 +95,7 @@ def predict(
 def _covariances(
     belief: Belief, observation: Tensor, observed: Tensor, H: Tensor, R: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Check the sizes of an update; return H, P and R as float64 matrices.
-
-    float64 whatever the dtype: with R at its floor beside a large P, S has a condition number of
-    1e6 and more, and the two terms of an updated covariance cancel along measured directions.
-    """
+    """Check the sizes of an update; return H, P and R as float64 matrices."""
     check_observed(observation, observed)
     obs, state = observation.shape[-1], belief.mean.shape[-1]
     if H.shape[-2:] != (obs, state):
@@ -144,9 +122,9 @@ def innovation(
     Args:
         belief: predicted belief, mean ``(*batch, state)``, cov ``(*batch, state, state)``.
         observation: x, shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``.
+        observed: bool, shape ``(*batch, obs)``, True = arrived.
         emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(obs, obs)``, or ``(obs,)`` for its diagonal.
+        emission_cov: R, shape ``(*batch, obs, obs)``, or ``(obs,)`` for its diagonal.
         offset: o = B a + d, shape ``(*batch, obs)``; None is 0.
 
     Returns:
@@ -155,9 +133,7 @@ def innovation(
         entries; S ``(*batch, obs, obs)`` over all components, observed or not.
 
     Example:
-        >>> import torch
-        >>> belief = Belief(torch.zeros(2), torch.eye(2))
-        >>> seen = torch.tensor([True, False])
+        >>> belief, seen = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([True, False])
         >>> v, S = innovation(belief, torch.ones(2), seen, torch.eye(2), torch.eye(2))
         >>> v.tolist(), S.diagonal().tolist()
         ([1.0, 0.0], [2.0, 2.0])
@@ -197,12 +173,9 @@ def update(
     Arguments are those of :func:`innovation`; it returns the filtered belief.
 
     Example:
-        >>> import torch
-        >>> belief = Belief(torch.zeros(2), torch.eye(2))
-        >>> seen = torch.tensor([True, False])
+        >>> belief, seen = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([True, False])
         >>> mean, cov = update(belief, torch.ones(2), seen, torch.eye(2), 3 * torch.eye(2))
-        >>> expected = torch.diag(torch.tensor([0.75, 1.0]))
-        >>> mean.tolist(), torch.allclose(cov, expected)
+        >>> mean.tolist(), torch.allclose(cov, torch.diag(torch.tensor([0.75, 1.0])))
         ([0.25, 0.0], True)
     """
     dtype = belief.mean.dtype
@@ -240,7 +213,6 @@ def sequential_update(
     Arguments are those of :func:`innovation`, R diagonal; it returns the filtered belief.
 
     Example:
-        >>> import torch
         >>> belief, H = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
         >>> step = belief, torch.ones(2), torch.ones(2, dtype=torch.bool), H, torch.ones(2)
         >>> all(torch.allclose(a, b) for a, b in zip(sequential_update(*step), update(*step)))
@@ -274,12 +246,9 @@ def log_likelihood(
     Arguments are those of :func:`innovation`; it returns nats, shape ``(*batch,)``.
 
     Example:
-        >>> import torch
-        >>> belief = Belief(torch.zeros(1), torch.zeros(1, 1))
-        >>> seen = torch.ones(1, dtype=torch.bool)
-        >>> value = log_likelihood(belief, torch.ones(1), seen, torch.eye(1), torch.eye(1))
-        >>> expected = torch.distributions.Normal(0.0, 1.0).log_prob(torch.ones(1))
-        >>> torch.allclose(value, expected)
+        >>> belief, one = Belief(torch.zeros(1), torch.zeros(1, 1)), torch.ones(1)
+        >>> value = log_likelihood(belief, one, one > 0, torch.eye(1), torch.eye(1))
+        >>> torch.allclose(value, torch.distributions.Normal(0.0, 1.0).log_prob(one))
         True
     """
     v, S = innovation(belief, observation, observed, emission_matrix, emission_cov, offset)
@@ -304,26 +273,17 @@ def update_by_mask(
     taken for a reading :math:`\mu + g / h` of variance :math:`1 / h - v` on top of R. For one
     missing entry mean and covariance are exact; several are matched from the same belief, once.
 
-    Args:
-        belief: filtered belief, mean ``(*batch, state)``, cov ``(*batch, state, state)``.
-        observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``.
-        emission_matrix: H, shape ``(obs, state)``.
-        emission_cov: R, shape ``(*batch, obs, obs)``, or ``(obs,)`` for its diagonal.
-        offset: B a + d, shape ``(*batch, obs)``.
-        mask_model: how likely readings are to arrive.
+    Arguments are those of :func:`innovation` with the filtered belief, and the ``mask_model``.
 
     Returns:
         The belief, and the log-probability of the mask, nats, shape ``(*batch,)``: entries that
         are missing together are counted as independent.
 
     Example:
-        >>> import torch
         >>> belief, zero = Belief(torch.zeros(1), torch.eye(1)), torch.zeros(1)
-        >>> nothing = torch.zeros(1, dtype=torch.bool)
-        >>> rarely_high = MaskModel(torch.zeros(1), torch.tensor([-2.0]))
+        >>> rarely_high = MaskModel(zero, torch.tensor([-2.0]))
         >>> after, _ = update_by_mask(
-        ...     belief, zero, nothing, torch.eye(1), torch.ones(1), zero, rarely_high)
+        ...     belief, zero, zero > 0, torch.eye(1), torch.ones(1), zero, rarely_high)
         >>> bool(after.mean > 0), bool(after.cov < 1)  # it is missing: it was probably high
         (True, True)
     """

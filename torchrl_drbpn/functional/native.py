@@ -1,9 +1,9 @@
 """The native form of the filter: one operator on the CPU, forward and back.
 
 At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
-time between the operations of the filter, not in them. ``csrc/filter.h`` holds the same sums; the
-package is built with it. ``torch.ops.torchrl_drbpn.filter_rows`` and its gradient check every
-tensor before they hand over a pointer; FakeTensors, tracing and vmap meet an ordinary operator.
+time between the operations of the filter, not in them; ``csrc/filter.h`` holds the same sums.
+``torch.ops.torchrl_drbpn.filter_rows`` and its gradient check every tensor before they hand over a
+pointer; FakeTensors, tracing and vmap meet an ordinary operator.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from torch.autograd import forward_ad
 
 from torchrl_drbpn.functional.pytorch_form import Filtered, run_in_pytorch
 from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, TransitionMLP
-
-__all__ = ["filter_rows", "native_status", "operator_arguments", "unsupported_reason"]
 
 _ABI = 1  # of csrc/filter.h
 _KINDS = {torch.float32: "float", torch.float64: "double"}
@@ -59,10 +57,7 @@ def load(path: Path) -> ctypes.CDLL | str:
 
 
 def native_status() -> str | None:
-    """Say why the native form of the filter cannot run on this machine.
-
-    Returns:
-        None where it can, else the reason: the PyTorch form runs instead.
+    """Say why the native form of the filter cannot run on this machine; None where it can.
 
     Example:
         >>> type(native_status()) in (type(None), str)
@@ -122,12 +117,7 @@ def filter_rows(model: StateSpace, rows: FilterInputs) -> Filtered:
 
 
 def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
-    """Return a model as the operator takes it.
-
-    That is Q, P_0, R, H, B, d, m_0, the network's weights and biases in one piece (autograd is slow
-    on lists of tensors), F or None, the widths of its layers, whether it is residual, and whether
-    it has tanh.
-    """
+    """Return a model as the operator takes it, the network's layers in one piece."""
     f = cast(TransitionMLP, model.transition)  # the rule saw to it
     layers = itertools.chain.from_iterable(zip(f.weights, f.biases, strict=True))
     return (

@@ -2,9 +2,8 @@
 
 The filter of deep variational reinforcement learning ([DVRL 2018]: Igl, Zintgraf, Le, Wood and
 Whiteson, *Deep Variational Reinforcement Learning for POMDPs*, ICML 2018). A particle is a
-deterministic memory h and a stochastic latent z. Only time is a loop. No random number is drawn
-here: the noise of a step is an argument, so that the same noise gives the same particles. In
-docstrings k counts particles, K is their number, q the proposal, p the model.
+deterministic memory h and a stochastic latent z. No random number is drawn here: the noise of a
+step is an argument. k counts particles, K is their number, q the proposal, p the model.
 """
 
 from __future__ import annotations
@@ -103,21 +102,13 @@ def diagonal_log_density(
     .. math:: \log p = -\tfrac12 \sum_{i: m_i}
         \left( (x_i - \mu_i)^2 / v_i + \log v_i + \log 2\pi \right)
 
-    With nothing observed the value is exactly 0.
-
-    Args:
-        value: x, shape ``(*batch, dim)``; missing entries may hold anything.
-        gaussian: mean and variance that broadcast with it.
-        observed: bool m, True = arrived, broadcasts with it; None: all of them.
-
-    Returns:
-        Shape ``(*batch,)``, nats.
+    Of ``value`` x ``(*batch, dim)``, a Gaussian that broadcasts with it, and the bool mask m, None:
+    everything arrived. Nats, ``(*batch,)``; with nothing observed exactly 0.
 
     Example:
         >>> gaussian = DiagonalGaussian(torch.zeros(2), torch.ones(2))
-        >>> x = torch.tensor([1.0, float("nan")])
-        >>> seen = torch.tensor([True, False])
-        >>> one = torch.distributions.Normal(0.0, 1.0).log_prob(torch.tensor(1.0))
+        >>> x, seen = torch.tensor([1.0, float("nan")]), torch.tensor([True, False])
+        >>> one = torch.distributions.Normal(0.0, 1.0).log_prob(x[0])
         >>> bool(torch.isclose(diagonal_log_density(x, gaussian, seen), one))
         True
     """
@@ -134,10 +125,8 @@ def log_mean_weight(log_weight: Tensor) -> Tensor:
 
     .. math:: \log \hat p(x_t \mid x_{<t}) = \log \frac1K \sum_k w_t^k
 
-    §3.2 [DVRL 2018]: its sum over time is a lower bound of the marginal log-likelihood, in
-    expectation, and the product of the mean weights is unbiased for the marginal likelihood.
-
-    From ``(*batch, particles)`` to ``(*batch,)``, nats.
+    §3.2 [DVRL 2018]: its sum over time is, in expectation, a lower bound of the marginal
+    log-likelihood. From ``(*batch, particles)`` to ``(*batch,)``, nats.
 
     Example:
         >>> log_mean_weight(torch.tensor([2.0, 4.0]).log()).exp().item()
@@ -167,15 +156,10 @@ def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
 
     .. math:: a_k = \min \{ j : \sum_{i \le j} \bar w_i > (k + u) / K \}, \qquad k = 0..K-1
 
-    Particle j has K w_j offspring in expectation, and that rounded up or down in every draw; equal
-    weights keep every particle. No gradient flows through the choice, as in [DVRL 2018].
-
-    Args:
-        log_weight: shape ``(*batch, particles)``, nats; need not be normalised.
-        uniform: u, on [0, 1), shape ``(*batch, 1)``.
-
-    Returns:
-        Ancestors, int64, shape ``(*batch, particles)``, ascending.
+    Particle j has K w_j offspring in expectation, and that rounded up or down in every draw. No
+    gradient flows through the choice, as in [DVRL 2018]. From log-weights ``(*batch, particles)``,
+    which need not be normalised, and u on [0, 1), ``(*batch, 1)``, to ascending int64 ancestors
+    ``(*batch, particles)``.
 
     Example:
         >>> log_weight = torch.tensor([0.5, 0.0, 0.25, 0.25]).log()
@@ -229,7 +213,7 @@ def particle_step(
         log_weight: of the step before, shape ``(*batch, particles)``, nats; zeros at a start.
         inputs: of this step, for the model.
         observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``.
+        observed: bool, shape ``(*batch, obs)``, True = arrived.
         noise: of this step.
 
     See also :func:`particle_sequence`, whose example has a model.
@@ -278,10 +262,8 @@ def particle_sequence(
         ...         seen = DiagonalGaussian(latent, torch.ones_like(latent))
         ...         return ParticleStep(seen, latent, latent)
         >>> noise = ParticleNoise(torch.randn(2, 5, 8, 3), torch.rand(2, 5, 1))
-        >>> start, nothing = torch.zeros(2, 5, 8, 3), torch.zeros(2, 5, 3, dtype=torch.bool)
-        >>> out = particle_sequence(
-        ...     Walk(), start, start[..., 0], nothing[..., 0], (), torch.zeros(2, 5, 3), nothing,
-        ...     noise)
+        >>> h, x = torch.zeros(2, 5, 8, 3), torch.zeros(2, 5, 3)
+        >>> out = particle_sequence(Walk(), h, h[..., 0], x[..., 0] > 0, (), x, x > 0, noise)
         >>> bool((out.log_likelihood.abs() < 1e-6).all())  # q = p and nothing seen: weight 1
         True
     """

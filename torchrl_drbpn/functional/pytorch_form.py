@@ -1,10 +1,9 @@
 """The filter in PyTorch operations: any device, every transformation, differentiable again.
 
 Where predicted covariances do not depend on the mean, the gains of a whole minibatch are one
-batched computation ahead of the mean recurrence. The gain comes from what is cheaper to factorise:
-S = H P H' + R, obs x obs, or the precision inv(P) + H' inv(R) H, state x state (diagonal R,
-obs > state). Everything is float64 but the transition: with R at its floor float32 loses most
-digits of a gain.
+batched computation ahead of the mean recurrence, from what is cheaper to factorise: S, obs x obs,
+or the precision, state x state. Everything is float64 but the transition: with R at its floor
+float32 loses most digits of a gain.
 """
 
 from __future__ import annotations
@@ -28,8 +27,6 @@ from torchrl_drbpn.functional.state_space import (
     propagate,
 )
 
-__all__ = ["run_in_pytorch", "run_step_by_step", "weighted_noise"]
-
 # Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step; leaves alone
 # what is there for every step.
 Choose = Callable[[Tensor], Tensor]
@@ -51,11 +48,7 @@ def weighted_noise(model: StateSpace, weight: Tensor | None) -> Tensor:
 
 
 def run_in_pytorch(model: StateSpace, rows: FilterInputs) -> Filtered:
-    """Filter where predicted covariances do not depend on the mean.
-
-    Returns:
-        Means, covariances (without gradient) where they are propagated, log-likelihoods.
-    """
+    """Filter where predicted covariances do not depend on the mean; return them if propagated."""
     observed, reset, action, mean = rows.observed, rows.reset, rows.previous_action, rows.mean
     H, R, dtype = model.emission_matrix.double(), model.emission_cov.double(), mean.dtype
     added = None if rows.weight is None else _added_noise(R, rows.weight)
@@ -105,9 +98,7 @@ def _run_covariances(
 ) -> tuple[Tensor, Tensor]:
     """Propagate and update covariances ahead of the means; ``own`` is Q or P_0 of each step.
 
-    Returns:
-        The predicted ones, with the gradient by ``own`` alone, and the filtered ones, without;
-        float64, ``(batch, time, state, state)``.
+    The predicted ones have the gradient by ``own`` alone, the filtered ones none.
     """
     given, observed = rows.reset, rows.observed
     H, R = model.emission_matrix.detach().double(), model.emission_cov.detach().double()

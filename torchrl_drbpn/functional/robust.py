@@ -16,14 +16,6 @@ from torchrl_drbpn.functional.gaussian import (
 )
 from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, predict_step
 
-__all__ = [
-    "Robust",
-    "check_robust",
-    "innovation_weights",
-    "robust_sequence_weights",
-    "robust_weights",
-]
-
 Robust = Literal["huber", "imq"]
 
 _NORMAL_MEDIAN = 0.6744897501960817  # of |z|, z standard normal: it turns a median into a deviation
@@ -54,17 +46,15 @@ def innovation_weights(
     times what the median of the other readings says S is too small by,
     :math:`\max(1, \mathrm{med}_{j \ne i} |v_j| / \sqrt{S_{jj}} / .6745)`.
 
-    In the update that follows :math:`R_w = R + \mathrm{diag}(r_i / w_i - r_i)`: the variance of the
-    forecast error is multiplied by :math:`|z_i| / c_i` (huber: in the mean the reading counts as if
-    it lay c_i deviations off) or :math:`1 + z_i^2 / (2 c_i)^2` (imq, the inverse multiquadric
-    [Duran-Martin et al. 2024]: it counts most, c_i deviations, where it lies twice as far off, and
-    is forgotten as it goes on). The filtered covariance grows with it.
+    In the update that follows :math:`R_w = R + \mathrm{diag}(r_i / w_i - r_i)`: in the mean a
+    reading counts as if it lay c_i deviations off (huber), or is forgotten as it goes on (imq, the
+    inverse multiquadric [Duran-Martin et al. 2024]).
 
     Args:
         residual: v, shape ``(*batch, obs)``, 0 where nothing arrived.
         innovation_cov: S, float64, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
         noise: r, the diagonal of R, shape ``(obs,)`` or ``(*batch, obs)``.
-        observed: bool, shape ``(*batch, obs)``.
+        observed: bool, shape ``(*batch, obs)``, True = arrived.
         robust: "huber" or "imq".
         threshold: c, standard deviations.
 
@@ -72,7 +62,6 @@ def innovation_weights(
         Weights in [0, 1], shape ``(*batch, obs)``, 1 where nothing arrived.
 
     Example:
-        >>> import torch
         >>> S = torch.ones(5, 5).double() + 0.01 * torch.eye(5).double()  # five that agree
         >>> v = torch.tensor([2.5, 0.0, 0.0, 0.0, 0.0]).double()  # 25 noise deviations, 2.5 of S
         >>> w = innovation_weights(v, S, 0.01 * torch.ones(5), torch.ones(5) > 0, "huber", 3.0)
@@ -122,14 +111,10 @@ def robust_weights(
     Arguments, result and errors are those of :func:`robust_sequence_weights`, without time.
 
     Example:
-        >>> import torch
-        >>> eye = torch.eye(3)
-        >>> model = StateSpace(
-        ...     lambda m, a: m, 3 * eye, eye, torch.ones(3), torch.zeros(3, 1), torch.zeros(3),
-        ...     torch.zeros(3), eye)
-        >>> state = torch.zeros(3), torch.zeros(1)
-        >>> x, seen = torch.tensor([100.0, 1.0, -1.0]), torch.ones(3, dtype=torch.bool)
-        >>> w = robust_weights(model, *state, x, seen, torch.tensor(False), robust="huber")
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model, seen = BeliefFilter(3, 1).state_space(), torch.ones(3) > 0
+        >>> x, start = torch.tensor([100.0, 0.1, -0.1]), (torch.zeros(3), torch.zeros(1))
+        >>> w = robust_weights(model, *start, x, seen, torch.tensor(True), robust="huber")
         >>> bool(w[0] < 0.03), w[1:].tolist()
         (True, [1.0, 1.0])
     """
@@ -169,16 +154,11 @@ def robust_sequence_weights(
             positive and finite, a model with a ``mask_model``.
 
     Example:
-        >>> import torch
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(
-        ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...     torch.zeros(2), eye)
-        >>> x = torch.zeros(4, 10, 2)
-        >>> w = robust_sequence_weights(
-        ...     model, torch.zeros(4, 2), torch.zeros(4, 10, 1), x, x == 0, x[..., 0] > 0,
-        ...     robust="imq")
-        >>> torch.equal(w, torch.ones_like(x))
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model, x = BeliefFilter(2, 1).state_space(), torch.zeros(4, 10, 2)
+        >>> start = torch.zeros(4, 2), torch.zeros(4, 10, 1)
+        >>> w = robust_sequence_weights(model, *start, x, x == 0, x[..., 0] == 0, robust="imq")
+        >>> torch.equal(w, torch.ones_like(x))  # each as it was expected
         True
     """
     check_robust(robust, threshold, model.mask_model)

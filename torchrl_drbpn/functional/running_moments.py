@@ -1,9 +1,7 @@
 """Count, mean and variance of incomplete data, batch by batch, without keeping the data.
 
 Only entries that were observed count, so every component has a count of its own. Batches are merged
-by the pairwise rule of Chan, Golub and LeVeque, which loses no precision where the mean is large
-beside the spread and gives the same result in whatever order the batches come. Outliers are clipped
-before they are learned from.
+by the pairwise rule, which loses no precision where the mean is large beside the spread.
 """
 
 from __future__ import annotations
@@ -14,8 +12,6 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import check_observed
-
-__all__ = ["RunningMoments", "masked_moments", "merge_moments", "spread", "winsorize"]
 
 # Its square is still a float64.
 _LARGEST = 1e150
@@ -45,15 +41,14 @@ class RunningMoments(NamedTuple):
 
 
 def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMoments:
-    r"""Compute the moments of the observed entries of a batch.
+    """Compute the moments of the observed entries of a batch.
 
     With `o` the mask: n = sum o,  mean = sum o x / n,  var = sum o (x - mean)^2 / n, each over the
     first dimension. What lies under a False entry is never used, NaN and infinity included.
 
     Args:
         value: the samples, shape ``(samples, *event)``.
-        observed: bool of that shape, True where an entry was observed; a ValueError where it is
-            not. None: all.
+        observed: bool of that shape, True = arrived; a ValueError for another. None: all.
 
     Returns:
         The moments, in float64; all 0 where nothing was observed.
@@ -123,7 +118,7 @@ def spread(moments: RunningMoments, eps: float) -> Tensor:
 def winsorize(
     value: Tensor, observed: Tensor, learned: RunningMoments, eps: float
 ) -> tuple[Tensor, Tensor]:
-    r"""Clip outliers to a bound, so that one reading cannot dominate the statistics.
+    """Clip outliers to a bound, so that one reading cannot dominate the statistics.
 
     A component with 100 learned readings and a variance above ``eps`` is clipped to its learned
     mean plus and minus 10 learned deviations: a scale that really grows can grow tenfold with each
@@ -143,8 +138,7 @@ def winsorize(
     Example:
         >>> nothing = RunningMoments(*torch.zeros(3, 1, dtype=torch.float64))
         >>> x = torch.cat([torch.randn(999, 1), torch.tensor([[1e30]])])
-        >>> bounded, _ = winsorize(x, torch.ones_like(x, dtype=torch.bool), nothing, 1e-8)
-        >>> bool(bounded.max() < 30)
+        >>> bool(winsorize(x, torch.ones_like(x) > 0, nothing, 1e-8)[0].max() < 30)
         True
     """
     value = value.double().masked_fill(~observed, 0.0).clamp(-_LARGEST, _LARGEST)

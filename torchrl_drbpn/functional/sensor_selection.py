@@ -1,8 +1,4 @@
-r"""Choose sensors: the components whose readings leave the belief least uncertain.
-
-With x = H s + eps, s ~ N(m, P) and eps ~ N(0, R), reading the rows S leaves the covariance
-:math:`P^+_S`, whatever the readings are (eq. 10 [DRBPN]), so that H, P and R alone rank sensors.
-"""
+"""Choose sensors: the components whose readings leave the belief least uncertain."""
 
 from __future__ import annotations
 
@@ -12,8 +8,6 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
-
-__all__ = ["SensorSelection", "select_sensors"]
 
 Criterion = Literal["D", "A"]
 
@@ -56,8 +50,8 @@ def select_sensors(
         = \tfrac12 \log|I + R_{SS}^{-1} H_S P H_S'|, \qquad
         \text{A:}\; \min_S \mathrm{tr}\, C P^+_S C'
 
-    :math:`P^+_S` is the filtered covariance of eq. (10) [DRBPN] with the rows S observed. Greedy:
-    the first k of a longer selection are the selection of k; a pick costs one rank-one update.
+    :math:`P^+_S` is the filtered covariance of eq. (10) [DRBPN] with the rows S observed, whatever
+    they read. Greedy: the first k of a longer selection are the selection of k.
 
     - D, diagonal R: :math:`I(s; x_S)` is monotone and submodular, hence at least
       :math:`1 - 1/e` of the best set of that size [Nemhauser, Wolsey, Fisher 1978; Krause,
@@ -94,9 +88,6 @@ def select_sensors(
         >>> P, R = torch.diag(torch.tensor([4.0, 1.0])), torch.tensor([0.5, 0.4, 0.5])
         >>> select_sensors(H, P, R, 3).indices.tolist()  # the second view comes last
         [1, 2, 0]
-
-    See also :func:`update`, whose covariance this is. For a trained
-    :class:`~torchrl_drbpn.BeliefFilter` P is ``filter.state_space().transition_cov``.
     """
     if criterion not in ("D", "A"):
         raise ValueError(f"`criterion` must be 'D' (log det) or 'A' (trace), got {criterion!r}.")

@@ -1,10 +1,8 @@
 """Beliefs about the past given all readings, and about the future given none: for logged data.
 
-Both propagate the covariance through the transition's Jacobian F: that of the model, or the one of
-each row where the model has none. Exact for a linear transition, the extended Kalman filter and
-smoother for another. A Q that was trained without propagation holds the share of the past already,
-which is then counted twice and makes the covariances too wide: train with
-``covariance="propagated"`` for these.
+Both propagate the covariance, exactly for a linear transition, else as the extended Kalman filter
+does. A Q that was trained without propagation holds the share of the past already, which makes the
+covariances too wide: train with ``covariance="propagated"`` for these.
 """
 
 from __future__ import annotations
@@ -19,8 +17,6 @@ from torchrl_drbpn.functional.gaussian import Belief, as_matrix, factorise, with
 from torchrl_drbpn.functional.kalman import predict, update, update_by_mask
 from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, TransitionMLP
 
-__all__ = ["Forecast", "Jacobian", "forecast", "row_jacobian", "smooth_sequence"]
-
 # F, shape (state, state), or a function of (mean, action) that returns (*batch, state, state).
 Jacobian = Tensor | Callable[[Tensor, Tensor], Tensor]
 
@@ -31,10 +27,6 @@ class Forecast(NamedTuple):
     Args:
         state: beliefs, mean ``(*batch, ahead, state)``, cov ``(*batch, ahead, state, state)``.
         observation: of the readings, noise included: ``(*batch, ahead, obs)``, ``(..., obs, obs)``.
-
-    Example:
-        >>> Forecast._fields
-        ('state', 'observation')
     """
 
     state: Belief
@@ -77,19 +69,12 @@ def smooth_sequence(
         ValueError: for a wrong shape or dtype, or a covariance that is not positive definite.
 
     Example:
-        >>> import torch
-        >>> one = torch.ones(1, 1)
-        >>> model = StateSpace(
-        ...     lambda m, a: m, one, one, torch.ones(1), 0 * one, torch.zeros(1), torch.zeros(1),
-        ...     one)
-        >>> seen = torch.tensor([True, False, True]).unsqueeze(-1)
-        >>> reset = torch.tensor([True, False, False])
-        >>> belief = smooth_sequence(model, torch.zeros(1), None, torch.zeros(3, 1),
-        ...                          torch.tensor([[0.0], [0.0], [3.0]]), seen, reset)
-        >>> bool((belief.mean.diff(dim=0) > 0).all())  # the gap leads to the reading behind it
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model, x = BeliefFilter(1, 1).state_space(), torch.zeros(3, 1)
+        >>> seen, reset = torch.tensor([[True], [False], [True]]), torch.zeros(3) > 0
+        >>> belief = smooth_sequence(model, x[0], None, x, x, seen, reset)
+        >>> bool(belief.cov[1] > belief.cov[0])  # in the gap less is known
         True
-
-    See also :func:`filter_sequence`, which reads the past alone.
     """
     belief = _start(model, mean, cov)
     given = FilterInputs(
@@ -154,14 +139,11 @@ def forecast(
         ValueError: for a wrong shape or dtype.
 
     Example:
-        >>> import torch
-        >>> one = torch.ones(1, 1)
-        >>> model = StateSpace(
-        ...     lambda m, a: m, one, one, torch.ones(1), 0 * one, torch.zeros(1), torch.zeros(1),
-        ...     one)
-        >>> ahead = forecast(model, torch.zeros(1), None, torch.zeros(3, 1))
-        >>> ahead.state.cov.flatten().tolist(), ahead.observation.cov.flatten().tolist()
-        ([1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model = BeliefFilter(1, 1).state_space()
+        >>> ahead = forecast(model, torch.zeros(1), None, torch.zeros(9, 1), jacobian=torch.eye(1))
+        >>> torch.allclose(ahead.state.cov[-1], 9 * model.transition_cov)
+        True
     """
     start, dtype, H = tuple(mean.shape[:-1]), mean.dtype, model.emission_matrix
     if action.shape[:-2] != start or action.shape[-1:] != (model.action_dim,) or action.ndim < 2:
@@ -185,16 +167,10 @@ def row_jacobian(
 ) -> Tensor:
     """Differentiate a transition by the mean, each row by itself; a network in closed form.
 
-    Args:
-        transition: f of (mean, action), row by row.
-        mean: shape ``(*batch, state)``.
-        action: shape ``(*batch, action)``.
-
-    Returns:
-        F, shape ``(*batch, state, state)``; differentiable again.
+    Of f of (mean, action), row by row, mean ``(*batch, state)`` and action ``(*batch, action)``;
+    F, shape ``(*batch, state, state)``, differentiable again.
 
     Example:
-        >>> import torch
         >>> F = row_jacobian(lambda m, a: m * a, torch.ones(2, 3), torch.full((2, 3), 5.0))
         >>> torch.equal(F, 5 * torch.eye(3).expand(2, 3, 3))
         True

@@ -13,8 +13,6 @@ from torch import Tensor
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix
 from torchrl_drbpn.functional.kalman import MaskModel
 
-__all__ = ["FilterInputs", "StateSpace", "TransitionMLP", "predict_step", "propagate"]
-
 # Of a propagated variance, state units: under a transition that expands, what no sensor has seen
 # for thousands of steps would leave the range of float32. The correlations stay.
 MAX_VARIANCE = 1e6
@@ -35,10 +33,8 @@ class TransitionMLP(NamedTuple):
         activation: "relu" or "tanh", between the layers.
 
     Example:
-        >>> import torch
-        >>> weights, biases = (torch.zeros(3, 5),), (torch.zeros(3),)
-        >>> f = TransitionMLP(weights, biases, residual=True, activation="relu")
-        >>> f(torch.ones(4, 3), torch.zeros(4, 2)).tolist() == torch.ones(4, 3).tolist()
+        >>> f = TransitionMLP((torch.zeros(3, 5),), (torch.zeros(3),), True, "relu")
+        >>> torch.equal(f(torch.ones(4, 3), torch.zeros(4, 2)), torch.ones(4, 3))
         True
     """
 
@@ -129,7 +125,7 @@ class StateSpace:
         s_1 \sim N(m_0, P_0)
 
     A covariance is a matrix ``(n, n)`` or its diagonal, the variances ``(n,)``. All tensors have
-    one floating dtype and one device.
+    one floating dtype and one device; a ValueError for a field of another, or of another shape.
 
     Args:
         transition: f; any callable of (mean, action). The native form takes
@@ -147,11 +143,7 @@ class StateSpace:
             propagates the covariance: P = F cov F' + Q. None: P = Q (eq. 8).
         mask_model: why entries are missing, each field ``(obs,)``; None: it is ignored.
 
-    Raises:
-        ValueError: for a field of another shape, dtype or device.
-
     Example:
-        >>> import torch
         >>> eye = torch.eye(2)
         >>> model = StateSpace(
         ...     lambda m, a: m, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
@@ -318,7 +310,6 @@ def propagate(jacobian: Tensor, cov: Tensor) -> Tensor:
     down, which leaves a covariance with the same correlations.
 
     Example:
-        >>> import torch
         >>> propagate(2 * torch.eye(2), torch.eye(2)).diagonal().tolist()
         [4.0, 4.0]
     """
@@ -358,14 +349,11 @@ def predict_step(
         The predicted belief.
 
     Example:
-        >>> import torch
-        >>> eye = torch.eye(2)
-        >>> model = StateSpace(
-        ...     lambda m, a: m + 1, eye, eye, torch.ones(2), torch.zeros(2, 1), torch.zeros(2),
-        ...     torch.zeros(2), eye)
-        >>> reset = torch.tensor([True, False])
-        >>> predict_step(model, torch.ones(2, 2), torch.zeros(2, 1), reset).mean.tolist()
-        [[0.0, 0.0], [2.0, 2.0]]
+        >>> from torchrl_drbpn import BeliefFilter
+        >>> model, reset = BeliefFilter(2, 1).state_space(), torch.tensor([True, False])
+        >>> belief = predict_step(model, torch.ones(2, 2), torch.zeros(2, 1), reset)
+        >>> torch.equal(belief.cov, torch.stack([model.full_initial_cov(), model.constant_cov()]))
+        True
     """
     row = reset.unsqueeze(-1)
     predicted = model.predicted_mean(mean, previous_action, row)

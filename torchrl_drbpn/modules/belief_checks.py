@@ -10,16 +10,9 @@ from torch import Tensor
 from torchrl_drbpn.functional import FilterOutput
 from torchrl_drbpn.functional.gaussian import NotPositiveDefiniteError
 
-__all__ = ["BeliefDivergedError"]
-
 
 class BeliefDivergedError(ValueError):
-    """Report that the learned model left the range of its numbers; the input was sound.
-
-    Example:
-        >>> issubclass(BeliefDivergedError, ValueError)
-        True
-    """
+    """Report that the learned model left the range of its numbers; the input was sound."""
 
 
 def checked(
@@ -30,10 +23,7 @@ def checked(
     observation: Tensor,
     observed: Tensor,
 ) -> FilterOutput:
-    """Filter, and raise if the result is not finite: name the input that caused it.
-
-    One sum tells. The mean is in it: where nothing was observed the likelihood is 0.
-    """
+    """Filter, and raise if the result is not finite: name the input that caused it."""
     silent = not validate or torch.compiler.is_compiling() or observation.is_meta
     failed: NotPositiveDefiniteError | None = None
     try:

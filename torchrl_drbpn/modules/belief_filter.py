@@ -37,8 +37,6 @@ from torchrl_drbpn.modules.state_space import (
     transition_functions,
 )
 
-__all__ = ["BeliefFilter"]
-
 _MAX_DEFAULT_STATE, _MIN_INITIAL_STD = 32, 1e-3
 
 
@@ -55,8 +53,7 @@ class BeliefFilter(nn.Module):
     one, N(initial_mean, initial_cov).
 
     Args:
-        obs_dim: number of sensor components.
-        action_dim: number of action components.
+        obs_dim, action_dim: components of an observation, of an action.
         state_dim: number of latent components; default ``min(obs_dim, 32)``.
 
     Keyword Args:
@@ -83,23 +80,19 @@ class BeliefFilter(nn.Module):
         validate: look at values too, not only at shapes: a NaN or inf that the mask calls
             observed raises ValueError. Needs a value on the host, so it is skipped while
             compiling or exporting; switch it off under ``vmap``.
-        device: of the parameters.
-        dtype: of the parameters.
+        device, dtype: of the parameters.
 
     Raises:
         ValueError: for a dimension under 1, parts whose dimensions disagree, an emission that is
             not affine, a covariance that is not positive definite, or another ``covariance``.
 
     Example:
-        >>> import torch
         >>> filter = BeliefFilter(obs_dim=5, action_dim=2)
-        >>> observed = torch.rand(3, 10, 5) < 0.7
-        >>> out = filter(torch.zeros(3, 5), None, torch.zeros(3, 10, 2), torch.randn(3, 10, 5),
-        ...              observed, torch.zeros(3, 10, dtype=torch.bool))
+        >>> observed, reset = torch.rand(3, 10, 5) < 0.7, torch.zeros(3, 10, dtype=torch.bool)
+        >>> action, x = torch.zeros(3, 10, 2), torch.randn(3, 10, 5)
+        >>> out = filter(torch.zeros(3, 5), None, action, x, observed, reset)
         >>> out.mean.shape, out.cov, out.log_likelihood.shape
         (torch.Size([3, 10, 5]), None, torch.Size([3, 10]))
-
-    See also :class:`torchrl_drbpn.BeliefFilterModule`, the same with TensorDict keys.
     """
 
     mean_jacobian: Tensor
@@ -214,14 +207,8 @@ class BeliefFilter(nn.Module):
         """Set ``mean_jacobian`` to the mean derivative of the transition over a batch of beliefs.
 
         Call it once a rollout, after the epochs: in between it stays, so that what was collected
-        is filtered alike in the loss.
-
-        Args:
-            mean: filtered means, shape ``(*batch, state)``.
-            previous_action: what followed them, shape ``(*batch, action)``.
-
-        Raises:
-            ValueError: if the covariance is constant.
+        is filtered alike in the loss. ``mean`` are filtered means, ``(*batch, state)``, and
+        ``previous_action`` what followed them. A ValueError if the covariance is constant.
         """
         if self.covariance != "propagated":
             raise ValueError("`refresh_jacobian` needs a filter with covariance='propagated'.")
@@ -310,11 +297,8 @@ class BeliefFilter(nn.Module):
     ) -> FilterOutput:
         """Filter sequences, episode starts inside them included.
 
-        Arguments and result are those of :func:`~torchrl_drbpn.functional.filter_sequence`; ``cov``
-        may be None, and is not read, where it is constant.
-
-        Raises:
-            ValueError: for a shape, a dtype or an observed value that cannot be.
+        Arguments, result and errors are those of :func:`~torchrl_drbpn.functional.filter_sequence`;
+        ``cov`` may be None, and is not read, where it is constant.
         """
         given = (mean, previous_action, observation, observed, reset)
         start = {

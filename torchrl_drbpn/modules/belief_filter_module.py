@@ -15,8 +15,6 @@ from torchrl_drbpn.functional.gaussian import without_autocast
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 
-__all__ = ["BeliefFilterModule"]
-
 _DEFAULT = ("features", ("belief", "mean"), ("belief", "log_likelihood"))
 _OPTIONAL = tuple(
     ("belief", name) for name in ("cov", "observation", "predicted_observation", "innovation_cov")
@@ -24,7 +22,7 @@ _OPTIONAL = tuple(
 
 
 class BeliefFilterModule(RecurrentBeliefModule):
-    r"""Read what arrived, write the belief: a :class:`BeliefFilter` with keys.
+    """Read what arrived, write the belief: a :class:`BeliefFilter` with keys.
 
     It takes the place of a ``GRUModule`` in a TorchRL pipeline: one step at a time by default,
     whole trajectories (last batch dimension = time) under ``set_recurrent_mode(True)``, its
@@ -42,12 +40,12 @@ class BeliefFilterModule(RecurrentBeliefModule):
         filter: the filter.
 
     Keyword Args:
-        in_key: the key of the observation, when every other keeps its name.
+        in_key, out_key: the key of the observation, of the features, when every other keeps its
+            name.
         in_keys: the entries read, in the order ``observation, observed, previous_action, is_init,
             ("recurrent", "mean"), ("recurrent", "cov") where there is one, ("recurrent", "age")``:
             a list of the first four or of all, or a dict from these names to yours. None in the
             place of ``observed``: everything arrives; of ``previous_action``: zeros.
-        out_key: the key of the features, when every other keeps its name.
         out_keys: the entries written, a list chosen from ``features``, ``("belief", "mean")``,
             ``("belief", "log_likelihood")`` (the default) and, computed only where asked for,
             ``("belief", "cov")``, ``("belief", "observation")`` (H m + B a + d of the filtered
@@ -66,21 +64,16 @@ class BeliefFilterModule(RecurrentBeliefModule):
         KeyError: at a call, if an entry is absent; the message says who writes it.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl.modules import set_recurrent_mode
         >>> module = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
         >>> data = TensorDict(
-        ...     observation=torch.randn(3, 10, 5),
-        ...     observed=torch.rand(3, 10, 5) < 0.7,
-        ...     previous_action=torch.zeros(3, 10, 2),
-        ...     is_init=torch.zeros(3, 10, 1, dtype=torch.bool),
-        ...     recurrent=dict(mean=torch.zeros(3, 10, 5), age=torch.ones(3, 10, 1).long()),
-        ...     batch_size=[3, 10])
-        >>> with set_recurrent_mode(True):
-        ...     out = module(data)
-        >>> out["features"].shape, out["belief", "log_likelihood"].shape
-        (torch.Size([3, 10, 5]), torch.Size([3, 10]))
+        ...     observation=torch.randn(3, 5), observed=torch.rand(3, 5) < 0.7,
+        ...     previous_action=torch.zeros(3, 2), is_init=torch.ones(3, 1) > 0,
+        ...     recurrent={"mean": torch.zeros(3, 5), "age": torch.zeros(3, 1).long()},
+        ...     batch_size=[3])
+        >>> out = module(data)
+        >>> out["features"].shape, out["next", "recurrent", "age"].flatten().tolist()
+        (torch.Size([3, 5]), [1, 1, 1])
     """
 
     filter: BeliefFilter

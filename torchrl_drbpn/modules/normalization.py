@@ -20,8 +20,6 @@ from torchrl_drbpn.functional.running_moments import (
     winsorize,
 )
 
-__all__ = ["MaskedObservationNorm"]
-
 
 class MaskedObservationNorm(TensorDictModuleBase):
     r"""Standardise what arrived by its running mean and deviation; the rest reads 0.
@@ -32,12 +30,10 @@ class MaskedObservationNorm(TensorDictModuleBase):
 
     It is the first module of a policy, ``TensorDictSequential(norm, belief, actor)``: the
     statistics are buffers, so they are saved, exported, compiled and sent to collectors with it.
-    ``forward`` is constant and never learns. :meth:`update` learns from a rollout; call it after
-    the epochs on that rollout, since before them the policy would no longer be the one that acted.
-    Until then it is the identity up to ``clip``.
-
-    One wild reading does not spoil the statistics: outliers are clipped before they are learned
-    from, see :func:`~torchrl_drbpn.functional.running_moments.winsorize`.
+    ``forward`` never learns. :meth:`update` learns from a rollout; call it after the epochs on that
+    rollout, since before them the policy would no longer be the one that acted. Until then it is
+    the identity up to ``clip``. Outliers are clipped before they are learned from, see
+    :func:`~torchrl_drbpn.functional.running_moments.winsorize`.
 
     Args:
         obs_dim: components of an observation.
@@ -61,16 +57,13 @@ class MaskedObservationNorm(TensorDictModuleBase):
 
     Example:
         >>> from tensordict import TensorDict
-        >>> x = torch.randn(8, 50, 3) * 5 + 100
-        >>> seen = torch.rand(8, 50, 3) < 0.7
-        >>> rollout = TensorDict(observation=x.where(seen, 0), observed=seen, batch_size=[8, 50])
+        >>> x, seen = torch.randn(8, 50, 3) * 5 + 100, torch.rand(8, 50, 3) < 0.7
+        >>> rollout = TensorDict(observation=x, observed=seen, batch_size=[8, 50])
         >>> norm = MaskedObservationNorm(3)
         >>> norm.update(rollout)
         >>> z = norm(rollout)["normalized_observation"]
-        >>> torch.allclose(z.sum((0, 1)) / seen.sum((0, 1)), torch.zeros(3), atol=1e-5)
-        True
-        >>> bool((z[~seen] == 0).all())
-        True
+        >>> bool(z[seen].mean().abs() < 1e-4), bool((z[~seen] == 0).all())
+        (True, True)
     """
 
     count: Tensor
@@ -135,9 +128,8 @@ class MaskedObservationNorm(TensorDictModuleBase):
     def normalize(self, observation: Tensor, observed: Tensor | None = None) -> Tensor:
         """Return clip((x - mean) / std), 0 where nothing arrived, as a new tensor.
 
-        Args:
-            observation: shape ``(*batch, obs)``, observation units; its floating dtype is kept.
-            observed: bool of that shape; None: everything arrived. A ValueError for another.
+        ``observation`` is ``(*batch, obs)``, observation units; its floating dtype is kept.
+        ``observed`` is bool of that shape, None: everything arrived. A ValueError for another.
         """
         self._check(observation, observed)
         absent = None

@@ -11,22 +11,19 @@ from torchrl_drbpn.functional import effective_sample_size
 from torchrl_drbpn.modules.particle_model import ParticleFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 
-__all__ = ["ParticleFilterModule"]
-
 _DEFAULT = ("features", ("belief", "log_likelihood"))
 _OPTIONAL = tuple(("belief", n) for n in ("observation", "latent", "effective_sample_size"))
 
 
 class ParticleFilterModule(RecurrentBeliefModule):
-    r"""Read what arrived, write features of particles: a :class:`ParticleFilter` with keys.
+    """Read what arrived, write features of particles: a :class:`ParticleFilter` with keys.
 
     Deep variational reinforcement learning [DVRL 2018] in the place of a ``GRUModule`` or a
     :class:`~torchrl_drbpn.BeliefFilterModule`, whose rules for modes and recurrent state hold
     here too. ``("belief", "log_likelihood")`` is the log of the particles' mean weight, so
     :class:`~torchrl_drbpn.BeliefModelLoss` of it is minus the evidence lower bound, and
-    :class:`~torchrl_drbpn.DRBPNLoss` serves unchanged. The filter is random, and yet a step gives
-    the same particles wherever it is computed, so that PPO's ratio is 1 before the first update:
-    see :meth:`ParticleFilter.noise`.
+    :class:`~torchrl_drbpn.DRBPNLoss` serves unchanged. A step gives the same particles wherever it
+    is computed, so that PPO's ratio is 1 before the first update: see :meth:`ParticleFilter.noise`.
 
     Args:
         filter: the filter.
@@ -43,17 +40,13 @@ class ParticleFilterModule(RecurrentBeliefModule):
     Example:
         >>> from tensordict import TensorDict
         >>> filter = ParticleFilter(5, 2, num_particles=4, hidden_dim=8, latent_dim=3)
-        >>> module = ParticleFilterModule(filter)
+        >>> module, state = ParticleFilterModule(filter), dict(particles=torch.zeros(3, 4, 8))
+        >>> state |= dict(log_weight=torch.zeros(3, 4), age=torch.zeros(3, 1).long())
         >>> data = TensorDict(
-        ...     observation=torch.randn(3, 5),
-        ...     observed=torch.rand(3, 5) < 0.7,
-        ...     previous_action=torch.zeros(3, 2),
-        ...     is_init=torch.ones(3, 1, dtype=torch.bool),
-        ...     recurrent=dict(particles=torch.zeros(3, 4, 8), log_weight=torch.zeros(3, 4),
-        ...                    age=torch.zeros(3, 1).long()),
-        ...     batch_size=[3])
+        ...     observation=torch.randn(3, 5), observed=torch.rand(3, 5) < 0.7, recurrent=state,
+        ...     previous_action=torch.zeros(3, 2), is_init=torch.ones(3, 1) > 0, batch_size=[3])
         >>> out, again = module(data.clone()), module(data)
-        >>> out["features"].shape, bool((out["features"] == again["features"]).all())
+        >>> out["features"].shape, torch.equal(out["features"], again["features"])
         (torch.Size([3, 8]), True)
     """
 

@@ -23,8 +23,6 @@ from torchrl_drbpn.functional.gaussian import check_observed
 from torchrl_drbpn.modules.belief_checks import BeliefDivergedError, refuse_readings
 from torchrl_drbpn.modules.state_space import check_dim
 
-__all__ = ["ParticleFilter"]
-
 _ENTRIES = 1 << 18  # places in the noise table: 1 MB in float32
 _WORD, _MIX = (1 << 32) - 1, (0x7FB5D329728EA185, 0x1B03738712FAD5C9)
 
@@ -56,8 +54,7 @@ class ParticleFilter(nn.Module):
         min_std: floor of the emission's standard deviation, observation units.
         latent_min_std: floor of the proposal's and the transition's.
         noise_seed: of the table that the noise is read from, see :meth:`noise`.
-        validate: look at values too: a NaN or inf that the mask calls observed raises ValueError.
-            Needs a value on the host, so it is skipped while compiling or exporting.
+        validate: as in :class:`~torchrl_drbpn.BeliefFilter`.
         device, dtype: of the parameters.
 
     Raises:
@@ -65,16 +62,11 @@ class ParticleFilter(nn.Module):
 
     Example:
         >>> filter = ParticleFilter(5, 2, num_particles=4, hidden_dim=8, latent_dim=3)
-        >>> action, x = torch.zeros(6, 10, 2), torch.randn(6, 10, 5)
-        >>> observed = torch.rand(6, 10, 5) < 0.7
-        >>> noise = filter.noise(action, x, observed, torch.zeros(6, 10, 1).long())
-        >>> start = torch.zeros(6, 10, dtype=torch.bool)
-        >>> out = filter(
-        ...     torch.zeros(6, 10, 4, 8), torch.zeros(6, 10, 4), start, action, x, observed, noise)
+        >>> step = torch.zeros(6, 2), torch.randn(6, 5), torch.rand(6, 5) < 0.7
+        >>> noise = filter.noise(*step, torch.zeros(6, 1).long())
+        >>> out = filter.step(torch.zeros(6, 4, 8), torch.zeros(6, 4), *step, noise)
         >>> filter.features(out).shape, out.log_likelihood.shape
-        (torch.Size([6, 10, 8]), torch.Size([6, 10]))
-
-    See also :class:`torchrl_drbpn.ParticleFilterModule`, the same with TensorDict keys.
+        (torch.Size([6, 8]), torch.Size([6]))
     """
 
     def __init__(
@@ -232,10 +224,8 @@ class ParticleFilter(nn.Module):
         both must see the same particles. The inputs of a step (observation, mask, action, age) are
         hashed; the hash chooses a place in a fixed table of standard normal numbers, drawn from
         ``noise_seed``, and the start of the resampling. So a step has one noise in the collector,
-        in GAE and in the loss, nothing is stored, and no generator's state belongs into a
-        checkpoint. Numbers are read in float32, so that casting data keeps its noise.
-
-        ``age``, int64 ``(*batch, 1)``, counts steps since the reset; shapes as in :meth:`step`.
+        in GAE and in the loss, and nothing is stored. Numbers are read in float32, so that casting
+        data keeps its noise. ``age``, int64 ``(*batch, 1)``, counts steps since the reset.
         """
         # Adding 0 turns -0 into 0.
         numbers = torch.cat([zero_missing(observation, observed), previous_action], -1) + 0.0

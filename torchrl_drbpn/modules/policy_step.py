@@ -20,8 +20,6 @@ from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
 from torchrl_drbpn.modules.state_space import GaussianTransition, jacobian_of
 
-__all__ = ["PolicyStep"]
-
 
 class PolicyStep(nn.Module):
     r"""Decide once: update the belief with what arrived, act on it; tensors in, tensors out.
@@ -42,8 +40,7 @@ class PolicyStep(nn.Module):
 
     Keyword Args:
         norm: standardises the observations first, where the belief reads standardised ones.
-        action_low: smallest action, shape ``(action,)``, action units; None: no limit.
-        action_high: largest action.
+        action_low, action_high: limits of an action, shape ``(action,)``, action units; None: none.
         sequential: take the readings one by one, which needs no Cholesky factor: for ONNX.
 
     Raises:
@@ -52,18 +49,13 @@ class PolicyStep(nn.Module):
             for ``sequential`` with a full R or a robust update.
 
     Example:
-        >>> import torch
-        >>> from torchrl_drbpn import BeliefFilter, BeliefFilterModule
+        >>> from torchrl_drbpn import BeliefFilter
         >>> belief = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
-        >>> step = PolicyStep(belief, torch.nn.Linear(5, 2))
-        >>> mean, age = step.initial_state(3)
-        >>> nothing, first = torch.zeros(3, 5, dtype=torch.bool), torch.ones(3, 1, dtype=torch.bool)
-        >>> zeros = torch.zeros(3, 5), nothing, torch.zeros(3, 2)
-        >>> action, mean, age, chosen, rejected = step(*zeros, first, mean, age)
+        >>> step, first = PolicyStep(belief, nn.Linear(5, 2)), torch.ones(3, 1) > 0
+        >>> reading = torch.zeros(3, 5), torch.zeros(3, 5) > 0, torch.zeros(3, 2)
+        >>> action, mean, age, chosen, rejected = step(*reading, first, *step.initial_state(3))
         >>> torch.equal(mean, belief.filter.initial_mean.expand(3, 5)), age.flatten().tolist()
         (True, [1, 1, 1])
-
-    See also :class:`torchrl_drbpn.BeliefFilterModule`, the same with TensorDict keys.
     """
 
     def __init__(
@@ -120,14 +112,7 @@ class PolicyStep(nn.Module):
         self.eval()
 
     def initial_state(self, batch: int) -> tuple[Tensor, ...]:
-        """Return mean, age and, if propagated, cov before the first step: zeros, as the primer.
-
-        Args:
-            batch: number of robots.
-
-        Returns:
-            mean ``(batch, state)``, age int64 ``(batch, 1)``, cov ``(batch, state, state)``.
-        """
+        """Return mean, age and, if propagated, cov before the first step of ``batch`` robots."""
         mean = self.filter.initial_mean.new_zeros(batch, self.filter.state_dim)
         age = torch.zeros(batch, 1, dtype=torch.int64, device=mean.device)
         cov = mean.new_zeros(batch, self.filter.state_dim, self.filter.state_dim)

@@ -18,8 +18,6 @@ from torchrl.modules.tensordict_module.rnn import recurrent_mode
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.particle_model import ParticleFilter
 
-__all__ = ["Keys", "RecurrentBeliefModule"]
-
 Keys = Sequence[NestedKey | None] | Mapping[NestedKey, NestedKey | None] | None
 
 _AGE = ("recurrent", "age")
@@ -50,21 +48,9 @@ class _Inputs(NamedTuple):
 class RecurrentBeliefModule(TensorDictModuleBase):
     """Give a filter keys, a recurrent mode, a primer and the rule of what a step starts from.
 
-    Args:
-        filter: the filter.
-        state: the recurrent entries but the age, from name to shape.
-        outputs: entries written by default, features first.
-        optional: entries written where asked for.
-        in_key: see :class:`~torchrl_drbpn.BeliefFilterModule`, as for those below.
-        in_keys: entries read.
-        out_key: where the features go.
-        out_keys: entries written.
-        default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
-
-    Example:
-        >>> from torchrl_drbpn import BeliefFilterModule, ParticleFilterModule
-        >>> issubclass(BeliefFilterModule, RecurrentBeliefModule)
-        True
+    ``state`` are the recurrent entries but the age, from name to shape; ``outputs`` are written by
+    default, features first; ``optional`` where asked for. For the rest see
+    :class:`~torchrl_drbpn.BeliefFilterModule`.
     """
 
     def __init__(
@@ -217,10 +203,7 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         self.filter.reset_parameters()
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Make the transform that puts the recurrent state into the environment.
-
-        Returns:
-            A primer of zeros; with an age of zero a row starts from the initial belief.
+        """Make the transform that puts the recurrent state, zeros, into the environment.
 
         Example:
             >>> from torchrl_drbpn import BeliefFilter, BeliefFilterModule

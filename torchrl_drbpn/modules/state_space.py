@@ -19,8 +19,6 @@ from torchrl_drbpn.functional import (
     row_jacobian,
 )
 
-__all__ = ["GaussianTransition", "LinearGaussianEmission"]
-
 CovKind = Literal["diag", "full"]
 Function = Callable[[Tensor, Tensor], Tensor]
 
@@ -102,14 +100,10 @@ class GaussianTransition(nn.Module):
 
     Eq. (2) and (8) [DRBPN]. f is a network of (mean, action), added to the mean where
     ``residual``. Q is a free parameter (the paper's runs) or a network of (mean, action)
-    (eq. 8), diagonal or full, with a floor on its standard deviations.
-
-    With a constant Q the gains of a whole minibatch are computed at once; a network Q makes the
-    covariances depend on the past, so the filter runs step by step.
+    (eq. 8), which makes the filter run step by step.
 
     Args:
-        state_dim: number of latent components.
-        action_dim: number of action components.
+        state_dim, action_dim: components of the state, of an action.
 
     Keyword Args:
         hidden_sizes: widths of the hidden layers of f (and of the network Q).
@@ -121,20 +115,16 @@ class GaussianTransition(nn.Module):
         cov_network: whether Q is a network of (mean, action).
         init_std: standard deviation Q starts from, state units.
         min_std: floor of the standard deviation, state units.
-        device: of the parameters.
-        dtype: of the parameters.
+        device, dtype: of the parameters.
 
     Raises:
         ValueError: for a dimension under 1, an unknown choice, or a floor above the start.
 
     Example:
-        >>> import torch
         >>> transition = GaussianTransition(state_dim=3, action_dim=2)
         >>> belief = transition(torch.zeros(5, 3), torch.zeros(5, 2))
         >>> belief.mean.shape, belief.cov.shape
         (torch.Size([5, 3]), torch.Size([5, 3, 3]))
-
-    See also :func:`torchrl_drbpn.functional.predict`.
     """
 
     def __init__(
@@ -223,11 +213,7 @@ class GaussianTransition(nn.Module):
 def jacobian_of(
     transition: nn.Module, mean: Tensor, action: Tensor, *, average: bool = False
 ) -> Tensor:
-    """Return the derivative of a transition's mean by the mean, of each row or averaged over all.
-
-    In closed form for a GaussianTransition whose ``forward`` is its own, by torch.func for another.
-    Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
-    """
+    """Return the derivative of a transition's mean by the mean, of each row or the average."""
     f = transition_functions(transition)[0]
     if average and isinstance(f, TransitionMLP):
         return f.jacobian(mean, action, average=True)
@@ -238,10 +224,7 @@ def jacobian_of(
 def transition_functions(
     transition: nn.Module,
 ) -> tuple[TransitionMLP | Function, Tensor | Function]:
-    """Return f and Q of a transition as :class:`~torchrl_drbpn.functional.StateSpace` takes them.
-
-    A :class:`GaussianTransition` is taken apart unless a subclass has a ``forward`` of its own.
-    """
+    """Return f and Q as StateSpace takes them; a ``forward`` that a subclass has counts."""
     if (
         not isinstance(transition, GaussianTransition)
         or type(transition).forward is not GaussianTransition.forward
@@ -262,9 +245,7 @@ class LinearGaussianEmission(nn.Module):
     bounded: on clean data R shrinks without end otherwise.
 
     Args:
-        obs_dim: number of sensor components.
-        state_dim: number of latent components.
-        action_dim: number of action components.
+        obs_dim, state_dim, action_dim: components of an observation, the state, an action.
 
     Keyword Args:
         cov: "diag" or "full", the kind of R. A diagonal R opens the information form.
@@ -272,15 +253,13 @@ class LinearGaussianEmission(nn.Module):
         min_std: floor of the standard deviation, observation units.
         fixed_matrix: keep H = [I 0]; loses no generality where state >= obs, and keeps the
             state's units those of the observation.
-        device: of the parameters.
-        dtype: of the parameters.
+        device, dtype: of the parameters.
 
     Raises:
         ValueError: for a dimension under 1, an unknown choice, a floor above the start, or
             ``fixed_matrix`` with state < obs.
 
     Example:
-        >>> import torch
         >>> emission = LinearGaussianEmission(obs_dim=4, state_dim=3, action_dim=2)
         >>> emission(torch.zeros(5, 3), torch.zeros(5, 2)).shape
         torch.Size([5, 4])
