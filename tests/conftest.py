@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -24,7 +23,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.fixture(scope="session")
-def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def smoke(tmp_path_factory):
     """Run the smoke experiment of the recipe once, to its end; nobody may change its folder."""
     from recipe_tools import SMOKE, run
 
@@ -34,7 +33,7 @@ def smoke(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _global_state() -> Iterator[None]:
+def _global_state():
     """Recipes set both; no test may depend on which one ran before."""
     threads = torch.get_num_threads()
     with torch.random.fork_rng(devices=[]):
@@ -43,13 +42,13 @@ def _global_state() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def trained_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def trained_run(tmp_path_factory):
     """Run folders after one rollout with two fifths missing, each made once: not to be written."""
     from recipe_tools import make_folder
 
     made: dict[tuple[str, ...], Path] = {}
 
-    def folder(belief: str = "drbpn", *overrides: str) -> Path:
+    def folder(belief="drbpn", *overrides):
         key = (belief, *overrides)
         if key not in made:
             path = tmp_path_factory.mktemp("runs") / belief
@@ -60,10 +59,10 @@ def trained_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]
 
 
 @pytest.fixture(scope="session")
-def drbpn(trained_run: Callable[..., Path]) -> Path:
+def drbpn(trained_run):
     return trained_run()
 
 
 @pytest.fixture(scope="session")
-def feedforward(trained_run: Callable[..., Path]) -> Path:
+def feedforward(trained_run):
     return trained_run("none")

@@ -8,7 +8,6 @@ belief that has weights of its own is refused.
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import pytest
 import torch
@@ -25,7 +24,7 @@ SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.s
 
 
 @pytest.fixture(scope="module")
-def acktr(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def acktr(tmp_path_factory):
     """Run the smoke experiment once, to its end."""
     folder = tmp_path_factory.mktemp("run") / "smoke"
     assert run(folder, *SMOKE) == 0
@@ -41,7 +40,7 @@ def rollout_of(*overrides: str) -> tuple[Training, TensorDictBase]:
     return training, data
 
 
-def test_a_run_leaves_its_numbers_and_no_column_of_ppo(acktr: Path) -> None:
+def test_a_run_leaves_its_numbers_and_no_column_of_ppo(acktr):
     rows = read_table(acktr / "metrics.csv")
     assert [int(row["frames"]) for row in rows] == [128, 256, 384, 512]
     filled = {key for key, value in rows[-1].items() if value}
@@ -50,7 +49,7 @@ def test_a_run_leaves_its_numbers_and_no_column_of_ppo(acktr: Path) -> None:
     assert len(read_table(acktr / "evaluation.csv")) == 4
 
 
-def test_a_stopped_run_goes_on_to_the_last_bit(acktr: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on_to_the_last_bit(acktr, tmp_path):
     broken = shutil.copytree(acktr, tmp_path / "broken")
     last_checkpoint(broken).unlink()
     assert resume(broken) == 0
@@ -60,10 +59,10 @@ def test_a_stopped_run_goes_on_to_the_last_bit(acktr: Path, tmp_path: Path) -> N
     assert state["critic_optimizer"]["state"]
 
 
-def test_the_value_comes_nearer_to_its_targets() -> None:
+def test_the_value_comes_nearer_to_its_targets():
     training, data = rollout_of("algo.critic.steps=25", "algo.critic.lr=0.1")
 
-    def error() -> float:
+    def error():
         with torch.no_grad():
             value = training.agent.value(data)
         return (value - data.get("value_target")).square().mean().item() / 2
@@ -74,7 +73,7 @@ def test_the_value_comes_nearer_to_its_targets() -> None:
     assert error() < 0.5 * before
 
 
-def test_the_policy_climbs_its_objective_and_reports_its_divergence() -> None:
+def test_the_policy_climbs_its_objective_and_reports_its_divergence():
     training, data = rollout_of("algo.policy.momentum=0", "algo.policy.lr=0.2")
     advantage = data.get("advantage").squeeze(-1)
     advantage = (advantage - advantage.mean()) / advantage.std()
@@ -92,7 +91,7 @@ def test_the_policy_climbs_its_objective_and_reports_its_divergence() -> None:
 @pytest.mark.parametrize(
     ("desired", "factor"), [(1e-9, 1 / 1.5), (1.0, 1.5)], ids=["too far", "too near"]
 )
-def test_the_step_size_follows_the_divergence(desired: float, factor: float) -> None:
+def test_the_step_size_follows_the_divergence(desired, factor):
     training, data = rollout_of(f"algo.desired_kl={desired}", "algo.policy.momentum=0")
     steps = [training.algorithm.update(data, 1.0)["lr"] for _ in range(2)]
     assert steps[0] == 0.03
@@ -100,13 +99,13 @@ def test_the_step_size_follows_the_divergence(desired: float, factor: float) -> 
 
 
 @pytest.mark.slow
-def test_the_divergence_comes_to_the_one_asked_for() -> None:
+def test_the_divergence_comes_to_the_one_asked_for():
     training, config = assembled(*SMOKE, "algo.policy.momentum=0.5")
     kls = [train_rollout(training, config)[0]["kl"] for _ in range(40)]
     assert 0.001 < sum(kls[20:]) / 20 < 0.004
 
 
-def test_the_generator_of_the_whole_process_is_left_alone() -> None:
+def test_the_generator_of_the_whole_process_is_left_alone():
     training, data = rollout_of()
     before = torch.get_rng_state()
     training.algorithm.update(data, 1.0)
@@ -114,7 +113,7 @@ def test_the_generator_of_the_whole_process_is_left_alone() -> None:
 
 
 @pytest.mark.parametrize("belief", ["drbpn", "gru", "transformer"])
-def test_a_belief_with_weights_of_its_own_is_refused(belief: str) -> None:
+def test_a_belief_with_weights_of_its_own_is_refused(belief):
     with pytest.raises(UserError, match=r"`algo=acktr` must have a belief module without weights"):
         assembled("algo=acktr", f"belief={belief}", "env=inverted_pendulum")
 
@@ -129,7 +128,7 @@ def test_a_belief_with_weights_of_its_own_is_refused(belief: str) -> None:
         ("algo.critic.momentum=1", r"`algo`: `momentum` must lie in \[0, 1\)"),
     ],
 )
-def test_bad_settings_are_refused_in_one_line(override: str, line: str) -> None:
+def test_bad_settings_are_refused_in_one_line(override, line):
     with pytest.raises(UserError, match=line) as error:
         assembled(*SMOKE, override)
     assert "\n" not in str(error.value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import pytest
 import torch
@@ -120,7 +119,7 @@ def test_every_belief_trains_with_it(belief):
     assert grad[:, -data[COMPLETE].shape[-1] :].abs().min() > 0
 
 
-def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path: Path):
+def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path):
     from evaluation.trained import load_trained_agent
 
     assert run(tmp_path / "run", *SMOKE, "total_frames=128") == 0

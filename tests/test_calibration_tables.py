@@ -48,7 +48,7 @@ def steps_with(observed: torch.Tensor, **more: torch.Tensor) -> dict[str, torch.
     }
 
 
-def test_errors_are_sorted_by_arrival_and_by_steps_since_last_seen() -> None:
+def test_errors_are_sorted_by_arrival_and_by_steps_since_last_seen():
     observed = torch.tensor([1, 0, 0, 0, 1, 0], dtype=torch.bool).reshape(1, 6, 1)
     error = torch.tensor([9, 1, 2, 3, 8, 5], dtype=torch.float64).reshape(1, 6, 1)
     tally = Tally(class_names(BINS), torch.tensor([6.0]), torch.tensor([2.0]), 1)
@@ -88,7 +88,7 @@ def known_forecasts(std: float) -> Tally:
     return tally
 
 
-def test_a_right_belief_is_found_consistent_and_covers_what_it_claims() -> None:
+def test_a_right_belief_is_found_consistent_and_covers_what_it_claims():
     tally = known_forecasts(1.0)
     rows = list(calibration_rows(tally, resamples=200, seed=0))
     for row in rows:
@@ -109,7 +109,7 @@ def test_a_right_belief_is_found_consistent_and_covers_what_it_claims() -> None:
     assert all(curve[f"under_{p}"] == pytest.approx(p / 100, abs=0.02) for p in (5, 50, 95))
 
 
-def test_a_belief_that_is_too_sure_is_found_so_by_every_statistic() -> None:
+def test_a_belief_that_is_too_sure_is_found_so_by_every_statistic():
     right, sure = known_forecasts(1.0), known_forecasts(0.5)
     first, second = (
         {tuple(r.values())[:5]: r for r in calibration_rows(t, resamples=20, seed=0)}
@@ -124,7 +124,7 @@ def test_a_belief_that_is_too_sure_is_found_so_by_every_statistic() -> None:
     assert second[key]["log_score"] > first[key]["log_score"]
 
 
-def test_nis_by_class_are_those_of_the_rows_of_a_class_alone() -> None:
+def test_nis_by_class_are_those_of_the_rows_of_a_class_alone():
     observed = torch.ones(1, 2, 2, dtype=torch.bool)
     observed[0, 0, 1] = False  # at step 1 one sensor was seen the step before, one never
     cov = torch.tensor([[2.0, 1.0], [1.0, 2.0]], dtype=torch.float64).expand(1, 2, 2, 2)
@@ -142,7 +142,7 @@ def test_nis_by_class_are_those_of_the_rows_of_a_class_alone() -> None:
 # Intervals -------------------------------------------------------------------------------------
 
 
-def test_an_interval_over_few_episodes_holds_the_mean_as_often_as_it_claims() -> None:
+def test_an_interval_over_few_episodes_holds_the_mean_as_often_as_it_claims():
     """Plain percentiles hold it in .91 of the cases; .007 is a standard error of 1000 trials."""
     generator = torch.Generator().manual_seed(0)
     ones, held = torch.ones(10, dtype=torch.float64), 0
@@ -153,7 +153,7 @@ def test_an_interval_over_few_episodes_holds_the_mean_as_often_as_it_claims() ->
     assert 0.93 <= held / 1000 <= 0.97
 
 
-def test_nothing_to_count_is_an_empty_cell_and_one_episode_has_no_interval() -> None:
+def test_nothing_to_count_is_an_empty_cell_and_one_episode_has_no_interval():
     resampling = Resampling(3, 50, seed=0)
     one = torch.tensor([0.0, 4.0, 0.0], dtype=torch.float64)
     for numerator, denominator in ((torch.zeros(3), torch.zeros(3)), (None, one)):
@@ -191,7 +191,7 @@ def test_the_crps_without_a_spread_is_the_absolute_error():
 def test_no_other_deviation_or_mean_scores_better_than_the_right_one():
     value = randn(50_000, seed=7)
 
-    def mean_score(mean: float, std: float) -> float:
+    def mean_score(mean, std):
         return gaussian_crps(value, torch.tensor(mean), torch.tensor(std)).mean().item()
 
     others = [(0.0, 0.7), (0.0, 1.4), (0.3, 1.0), (-0.3, 1.0)]

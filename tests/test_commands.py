@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 from evaluation_tools import configured
@@ -70,8 +68,8 @@ COMMANDS = ("evaluate", "diagnose", "export", "play", "plot_sensors", "report", 
     ],
 )  # fmt: skip
 def test_bad_input_is_answered_with_one_line_before_anything_is_done(
-    drbpn: Path, tmp_path: Path, name: str, changes: dict[str, Any], line: str
-) -> None:
+    drbpn, tmp_path, name, changes, line
+):
     config = configured(name) | {"run": str(drbpn), "start": 0} | changes
     if "out" not in changes:
         config["out"] = str(tmp_path / ("film.gif" if name == "play" else "out"))
@@ -84,7 +82,7 @@ def test_bad_input_is_answered_with_one_line_before_anything_is_done(
 
 
 @pytest.mark.parametrize("name", ["diagnose", "plot_sensors"])
-def test_several_runs_need_a_folder(drbpn: Path, feedforward: Path, name: str) -> None:
+def test_several_runs_need_a_folder(drbpn, feedforward, name):
     with pytest.raises(UserError, match="`out` must name a folder for 2 runs"):
         importlib.import_module(name).run(
             configured(name) | {"run": [str(drbpn), str(feedforward)]}
@@ -92,9 +90,7 @@ def test_several_runs_need_a_folder(drbpn: Path, feedforward: Path, name: str) -
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_line_goes_to_standard_error_with_status_2(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_line_goes_to_standard_error_with_status_2(name, tmp_path, monkeypatch, capsys):
     for words in (["run=nowhere", f"out={tmp_path}"], ["runs=x"]):
         if name == "evaluate":
             words = words[:1]

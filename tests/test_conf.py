@@ -6,8 +6,6 @@ answered with one line that names the setting, and the nearest one where there i
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from evaluation.points import missingness_kind, missingness_name
 from omegaconf import OmegaConf
@@ -25,7 +23,7 @@ CHOICES = sorted(
 
 
 @pytest.mark.parametrize(("group", "name"), CHOICES, ids=lambda value: value)
-def test_every_choice_of_every_group_composes_and_passes_the_checks(group: str, name: str) -> None:
+def test_every_choice_of_every_group_composes_and_passes_the_checks(group, name):
     own = ["env.id=x", "env.make._target_=x"] if name == "torchrl" else []
     config = make_config(f"{group}={name}", *own)
     assert config.optim.lr > 0
@@ -40,7 +38,7 @@ def test_every_choice_of_every_group_composes_and_passes_the_checks(group: str, 
      ("env=hopper", "+env.kwargs.terminate_when_unhealthy=false")],
     ids=" ".join,
 )  # fmt: skip
-def test_what_is_composed_is_built(words: tuple[str, ...]) -> None:
+def test_what_is_composed_is_built(words):
     training, config = assembled(*words, "collector.num_envs=8")
     assert training.env.batch_size == (8,)
     data = training.collector.rollout()
@@ -48,7 +46,7 @@ def test_what_is_composed_is_built(words: tuple[str, ...]) -> None:
     assert data["normalized_observation"].isfinite().all()
 
 
-def test_overlays_can_be_combined_and_the_command_line_wins() -> None:
+def test_overlays_can_be_combined_and_the_command_line_wins():
     config = make_config("experiment=[paper,clean]", "env=hopper")
     assert env_name(config) == "Hopper-v4"
     assert (missingness_kind(config.missingness), config.noise.sigma) == ("none", 0.0)
@@ -57,7 +55,7 @@ def test_overlays_can_be_combined_and_the_command_line_wins() -> None:
 
 
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)
-def test_every_default_is_explained_on_its_line_or_above(path: Path) -> None:
+def test_every_default_is_explained_on_its_line_or_above(path):
     structure = ("defaults:", "hydra:", "_target_:", "_partial_:", "name:", "- ", "in_keys:")
     if (
         path.parent.name in ("study", "experiment") or path.stem == "sensors"
@@ -73,7 +71,7 @@ def test_every_default_is_explained_on_its_line_or_above(path: Path) -> None:
             )
 
 
-def test_cfg_job_prints_everything_that_is_built(tmp_path: Path) -> None:
+def test_cfg_job_prints_everything_that_is_built(tmp_path):
     done = command("ppo_drbpn.py", "--cfg", "job", "--resolve", "env=hopper", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     printed = OmegaConf.create(done.stdout)
@@ -108,7 +106,7 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path: Path) -> None:
         ("env.name=CartPole-v1", "`env.name` is no setting: did you mean"),
     ],
 )
-def test_what_can_not_be_composed_is_one_line(word: str, line: str) -> None:
+def test_what_can_not_be_composed_is_one_line(word, line):
     with pytest.raises(UserError) as error:
         make_config(word)
     assert str(error.value).startswith(line)
@@ -141,14 +139,14 @@ def test_what_can_not_be_composed_is_one_line(word: str, line: str) -> None:
     ],
     ids=" ".join,
 )  # fmt: skip
-def test_what_can_not_be_built_is_one_line(words: list[str], line: str) -> None:
+def test_what_can_not_be_built_is_one_line(words, line):
     with pytest.raises(UserError) as error:
         assembled(*words)
     assert str(error.value).startswith(line)
     assert "\n" not in str(error.value)
 
 
-def test_missingness_has_one_name_that_reads_back() -> None:
+def test_missingness_has_one_name_that_reads_back():
     kinds = ("none", "mcar", "mar", "nmar", "outages", "delay", "multi_rate")
     names = [missingness_name(make_config(f"missingness={n}").missingness) for n in kinds]
     assert names == ["none:0", "mcar:0.5", "mar:0.5", "nmar:0.5", "outages:0.5:20:sensor",
@@ -158,7 +156,7 @@ def test_missingness_has_one_name_that_reads_back() -> None:
         choice("missingness", "mcar", mean_length=3)
 
 
-def test_a_configuration_is_written_as_it_was_composed(tmp_path: Path) -> None:
+def test_a_configuration_is_written_as_it_was_composed(tmp_path):
     config = make_config("env=hopper", "seed=7")
     write_config(tmp_path, config)
     assert load_config(tmp_path) == config
@@ -168,9 +166,7 @@ def test_a_configuration_is_written_as_it_was_composed(tmp_path: Path) -> None:
     assert loaded.transforms.noise.sigma == 3.0
 
 
-def test_resume_takes_the_settings_of_its_folder_and_only_the_allowed_overrides(
-    tmp_path: Path,
-) -> None:
+def test_resume_takes_the_settings_of_its_folder_and_only_the_allowed_overrides(tmp_path):
     write_config(tmp_path, make_config("env=hopper", "seed=7"))
     words = ["resume=x", "total_frames=4096", "evaluation.episodes=3", "logger=tensorboard"]
     config = resumed_config(make_config(*words), words, tmp_path)
@@ -189,7 +185,7 @@ def test_resume_takes_the_settings_of_its_folder_and_only_the_allowed_overrides(
         ("hydra.run.dir=there", "`resume` names the run folder already; .*hydra.run.dir=there"),
     ],
 )
-def test_resume_refuses_other_overrides(tmp_path: Path, word: str, line: str) -> None:
+def test_resume_refuses_other_overrides(tmp_path, word, line):
     write_config(tmp_path, make_config())
     with pytest.raises(UserError, match=line):
         resumed_config(make_config(), ["resume=x", word], tmp_path)

@@ -9,7 +9,6 @@ tables and figures whole, the same bytes for the same seed, and answers bad inpu
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,7 @@ import torch
 from analysis import calibration as diagnosis
 from analysis.calibration import Compared, Tally
 from analysis.calibration_figures import outage_figure
-from analysis.calibration_tables import (
-    calibration_rows,
-)
+from analysis.calibration_tables import calibration_rows
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.trained import TrainedAgent, load_trained_agent
 from evaluation_tools import parse, read_rows
@@ -47,12 +44,12 @@ DEFAULTS: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def folders(trained_run: Callable[..., Path]) -> dict[str, Path]:
+def folders(trained_run):
     return {name: trained_run(name) for name in BELIEFS}
 
 
 @pytest.fixture(scope="module")
-def agents(folders: dict[str, Path]) -> dict[str, TrainedAgent]:
+def agents(folders):
     return {name: load_trained_agent(folder) for name, folder in folders.items()}
 
 
@@ -68,13 +65,11 @@ def point(tally: Tally, estimate: str, entries: str) -> dict[str, torch.Tensor]:
 # What is counted -----------------------------------------------------------------------------
 
 
-def test_steps_since_last_seen_are_those_a_plain_loop_counts(
-    agents: dict[str, TrainedAgent], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_since_last_seen_are_those_a_plain_loop_counts(agents, monkeypatch):
     held: list[dict[str, torch.Tensor]] = []
     add = Tally.add
 
-    def keep(tally: Tally, rows: slice, steps: dict[str, torch.Tensor]) -> None:
+    def keep(tally, rows, steps):
         held.append({k: v.clone() for k, v in steps.items()})
         add(tally, rows, steps)
 
@@ -100,9 +95,7 @@ def test_steps_since_last_seen_are_those_a_plain_loop_counts(
 
 
 @pytest.mark.parametrize("name", ["drbpn", "gru", "gru_action", "transformer"])
-def test_a_forecast_gives_what_arrived_the_likelihood_that_the_belief_reports(
-    agents: dict[str, TrainedAgent], name: str
-) -> None:
+def test_a_forecast_gives_what_arrived_the_likelihood_that_the_belief_reports(agents, name):
     trained = agents[name]
     assert trained.agent.observing is not None
     observing = trained.agent.observing()
@@ -125,7 +118,7 @@ def test_a_forecast_gives_what_arrived_the_likelihood_that_the_belief_reports(
     env.close()
 
 
-def test_each_kind_of_belief_has_the_rows_of_what_it_knows(agents: dict[str, TrainedAgent]) -> None:
+def test_each_kind_of_belief_has_the_rows_of_what_it_knows(agents):
     known = {name: tally_of(agents[name], episodes=2) for name in BELIEFS}
     estimates = {name: {pair.estimate for pair in tally.sums} for name, tally in known.items()}
     references = {"last value", "running mean"}
@@ -138,18 +131,14 @@ def test_each_kind_of_belief_has_the_rows_of_what_it_knows(agents: dict[str, Tra
     assert spread == {"drbpn", "gru", "gru_action", "transformer"}
 
 
-def test_the_filled_value_is_the_last_value_once_a_sensor_was_seen(
-    agents: dict[str, TrainedAgent],
-) -> None:
+def test_the_filled_value_is_the_last_value_once_a_sensor_was_seen(agents):
     tally = tally_of(agents["fill"])
     filled = point(tally, "filtered", "missing")["squared"][:, :-1]
     last = point(tally, "last value", "missing")["squared"][:, :-1]
     torch.testing.assert_close(filled, last, rtol=1e-4, atol=1e-6)
 
 
-def test_the_truth_is_before_the_noise_and_readings_are_after_it(
-    agents: dict[str, TrainedAgent],
-) -> None:
+def test_the_truth_is_before_the_noise_and_readings_are_after_it(agents):
     # A last value that has just arrived is off by the sensor noise alone.
     trained = agents["none"]
     noise = trained.settings.noise.scale * trained.settings.noise.sigma
@@ -164,7 +153,7 @@ def test_the_truth_is_before_the_noise_and_readings_are_after_it(
 # Figures ---------------------------------------------------------------------------------------
 
 
-def test_the_outage_figure_shows_nis_coverage_and_crps_of_every_class() -> None:
+def test_the_outage_figure_shows_nis_coverage_and_crps_of_every_class():
     tally = known_forecasts(0.5)
     kind = {"task": "Task-v5", "point": "mcar:0.4", "method": "sure", "trained_on": "none"}
     kind |= {"noise_sigma": 1.0, "runs": 1, "missing_ratio": tally.missing_ratio}
@@ -195,8 +184,8 @@ def run(folders: Any, out: Path | None, **changes: Any) -> int:
 
 
 def test_the_command_leaves_tables_and_figures_and_says_who_has_no_estimate(
-    folders: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    folders, tmp_path, capsys
+):
     chosen = [str(folders[name]) for name in ("drbpn", "gru", "none")]
     points = ["trained", "mcar:0.4", "none:0"]  # the first two are the same
     assert run(chosen, tmp_path / "study", points=points) == 0
@@ -224,8 +213,8 @@ def test_the_command_leaves_tables_and_figures_and_says_who_has_no_estimate(
 
 
 def test_the_same_seed_gives_the_same_bytes_beside_the_run_where_no_folder_is_named(
-    folders: dict[str, Path], tmp_path: Path
-) -> None:
+    folders, tmp_path
+):
     folder = shutil.copytree(folders["drbpn"], tmp_path / "drbpn")
     assert run(str(folder), None) == 0
     assert run(str(folder), tmp_path / "out") == 0
@@ -233,9 +222,7 @@ def test_the_same_seed_gives_the_same_bytes_beside_the_run_where_no_folder_is_na
         assert path.read_bytes() == (folder / path.name).read_bytes(), path.name
 
 
-def test_every_point_of_an_evaluation_can_be_diagnosed(
-    folders: dict[str, Path], tmp_path: Path
-) -> None:
+def test_every_point_of_an_evaluation_can_be_diagnosed(folders, tmp_path):
     points = ["reduction:0.5:random", "noise:30", "spikes:0.5"]
     assert run(str(folders["drbpn"]), tmp_path, points=points) == 0
     rows = pd.read_csv(tmp_path / "precision.csv")
@@ -250,9 +237,7 @@ def test_every_point_of_an_evaluation_can_be_diagnosed(
     assert nis["spikes:0.5:5"] > 3 * nis["reduction:0.5:random"]
 
 
-def test_runs_of_one_kind_are_pooled_and_those_of_two_methods_are_not(
-    folders: dict[str, Path], tmp_path: Path
-) -> None:
+def test_runs_of_one_kind_are_pooled_and_those_of_two_methods_are_not(folders, tmp_path):
     """All are belief=drbpn: what is pooled goes by the method."""
     twin, plain = (shutil.copytree(folders["drbpn"], tmp_path / n) for n in ("twin", "plain"))
     write_config(twin, OmegaConf.merge(load_config(twin), {"seed": 1}))
@@ -274,9 +259,7 @@ def test_runs_of_one_kind_are_pooled_and_those_of_two_methods_are_not(
     assert counts["all"] == counts["drbpn"] + counts["twin"]
 
 
-def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(
-    folders: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(folders, tmp_path):
     assert run(str(folders["gru"]), tmp_path) == 0
     assert run(str(folders["fill"]), tmp_path) == 0
     left = {path.name for path in tmp_path.iterdir()}

@@ -11,7 +11,7 @@ import pytest
 import torch
 from analysis.calibration import diagnose
 from evaluation.table import Protocol, evaluate_condition
-from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation.trained import load_trained_agent
 from evaluation_tools import evaluate, parse, read_rows
 from training.config import explained
 from training.errors import UserError
@@ -20,7 +20,7 @@ from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
 
 
 @pytest.fixture(scope="module")
-def trained(drbpn: Path) -> TrainedAgent:
+def trained(drbpn):
     return load_trained_agent(drbpn)
 
 
@@ -33,21 +33,19 @@ def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
-def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
-    trained: TrainedAgent, monkeypatch: pytest.MonkeyPatch, value: float
-) -> None:
+def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(trained, monkeypatch, value):
     point, protocol = parse("mcar:0.5", trained.settings), Protocol(3, 1, 0, 1, None, 4.0)
     expected = evaluate_condition(trained, point, ["sampled"], protocol).to_dict("records")
     step, calls, actions = BeliefFilter.step, [], []
 
-    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+    def diverge(self, *args, **options):
         out = step(self, *args, **options)
         calls.append(len(calls))
         if len(calls) == 3:  # the second robot's belief, at its third step
             out.mean[1] = value
         return out
 
-    def look(env: GymnasiumBatchEnv, *arrays: Any) -> None:
+    def look(env, *arrays):
         actions.append(arrays[1].action.copy())
         advance(env, *arrays)
 
@@ -69,13 +67,11 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(
 
 
 @pytest.mark.parametrize("command", ["evaluate", "diagnose"])
-def test_the_belief_of_an_episode_that_is_over_goes_no_further(
-    trained: TrainedAgent, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_the_belief_of_an_episode_that_is_over_goes_no_further(trained, monkeypatch, command):
     """Fed its last observation for ever it may diverge, and stop an evaluation of others."""
     step, means, resets = BeliefFilter.step, [], []
 
-    def look(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+    def look(self, *args, **options):
         means.append(args[0].clone())
         resets.append(args[5].clone())
         return step(self, *args, **options)
@@ -100,12 +96,10 @@ def test_the_belief_of_an_episode_that_is_over_goes_no_further(
         assert (torch.stack(means)[length:, row] == 0).all()
 
 
-def test_the_next_evaluation_begins_with_every_robot(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_next_evaluation_begins_with_every_robot(drbpn, tmp_path, monkeypatch):
     step, left = BeliefFilter.step, [1]
 
-    def diverge(self: BeliefFilter, *args: Any, **options: Any) -> Any:
+    def diverge(self, *args, **options):
         out = step(self, *args, **options)
         if left:
             left.pop()
@@ -119,11 +113,11 @@ def test_the_next_evaluation_begins_with_every_robot(
 
 
 def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    drbpn, tmp_path, monkeypatch, capsys
+):
     whole = diagnose_recipe.diagnose
 
-    def diverging(trained: TrainedAgent, condition: Any, removed: Any, **how: Any) -> Any:
+    def diverging(trained, condition, removed, **how):
         if condition.missingness.eta == 0.8:
             raise BeliefDivergedError("the belief is no longer finite")
         return whole(trained, condition, removed, **how)
@@ -136,10 +130,8 @@ def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
         run_diagnosis(drbpn, tmp_path, points=["mcar:0.8"])
 
 
-def test_an_error_of_the_filter_is_one_line_of_every_command(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def job() -> int:
+def test_an_error_of_the_filter_is_one_line_of_every_command(capsys):
+    def job():
         raise BeliefDivergedError("the belief is no longer finite")
 
     assert explained(job) == 2

@@ -24,23 +24,21 @@ from evaluation import table as table_room
 from evaluation.episodes import StoppingPolicy, over_episodes
 from evaluation.folders import find_folders, override
 from evaluation.table import evaluate_tasks
-from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation.trained import load_trained_agent
 from evaluation_tools import configured, evaluate, read_rows
 from training.errors import UserError
 from training.run_folder import read_config, write_config
 
 
 @pytest.fixture(scope="module")
-def agent(drbpn: Path) -> TrainedAgent:
+def agent(drbpn):
     return load_trained_agent(drbpn)
 
 
 # Episodes -------------------------------------------------------------------------------------
 
 
-def test_more_episodes_only_add(
-    trained_run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_episodes_only_add(trained_run, tmp_path, monkeypatch):
     """Starts, gaps, noise, spikes, outages, actions and particles, across blocks of simulators."""
     monkeypatch.setattr(episodes_room, "BLOCK", 3)
     monkeypatch.setattr("evaluation.trained.BLOCK", 3)
@@ -55,7 +53,7 @@ def test_more_episodes_only_add(
     assert len(set(returns)) > len(returns) / 2  # no episode is another one again
 
 
-def test_the_global_generator_is_left_alone_and_stopping_gives_nothing(agent: TrainedAgent) -> None:
+def test_the_global_generator_is_left_alone_and_stopping_gives_nothing(agent):
     before = torch.get_rng_state()
     how = {"episodes": 2, "mode": "mean", "seed": 5}
     policy = StoppingPolicy(agent.agent)
@@ -66,7 +64,7 @@ def test_the_global_generator_is_left_alone_and_stopping_gives_nothing(agent: Tr
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_a_small_share_of_one_entry_weighs_as_what_it_is() -> None:
+def test_a_small_share_of_one_entry_weighs_as_what_it_is():
     """In two episodes one entry of 100 arrived in all: its likelihood is that of the evaluation."""
     few = pd.DataFrame({"return": 0.0, "length": 10, "missing_ratio": [0.99, 1, 1, 0]})
     few = few.assign(log_likelihood=[-2.5, 0, 0, np.nan], point=["few", "few", "none", "diverged"])
@@ -77,9 +75,7 @@ def test_a_small_share_of_one_entry_weighs_as_what_it_is() -> None:
 # The table ------------------------------------------------------------------------------------
 
 
-def test_one_row_an_episode_and_a_baseline_only_at_random(
-    drbpn: Path, feedforward: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_row_an_episode_and_a_baseline_only_at_random(drbpn, feedforward, tmp_path, capsys):
     small = configured()["grid"] | {"ratios": [0, 0.5]}
     rows = evaluate(tmp_path / "out.csv", drbpn, feedforward, grid=small)
     points = {(row["run"], row["point"]) for row in rows}
@@ -92,15 +88,13 @@ def test_one_row_an_episode_and_a_baseline_only_at_random(
     assert {row["eta"] for row in rows if row["point"] == "mcar:0.5"} == {"0.5"}
 
 
-def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(drbpn, tmp_path, monkeypatch):
     points = "none:0,'mcar:0.5','outages:0.5:4'"
     whole, broken = tmp_path / "whole.csv", tmp_path / "broken.csv"
     evaluate(whole, drbpn, points=points)
     real, calls = table_room.evaluate_condition, []
 
-    def dies(*args: Any, **options: Any) -> Any:
+    def dies(*args, **options):
         calls.append(args)
         if len(calls) == 2:
             raise KeyboardInterrupt
@@ -116,9 +110,7 @@ def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_the_order_of_the_table_is_that_of_the_points_and_others_are_kept(
-    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_order_of_the_table_is_that_of_the_points_and_others_are_kept(drbpn, tmp_path, capsys):
     out = tmp_path / "out.csv"
     evaluate(out, drbpn, points="'mcar:0.5'")
     evaluate(out, drbpn, points="'mar:0.5'", modes=["mean"])
@@ -132,7 +124,7 @@ def test_the_order_of_the_table_is_that_of_the_points_and_others_are_kept(
     assert out.read_bytes() == before
 
 
-def test_two_processes_give_the_numbers_of_one(drbpn: Path, tmp_path: Path) -> None:
+def test_two_processes_give_the_numbers_of_one(drbpn, tmp_path):
     options = {"points": "none:0,'mcar:0.5'", "robust": "huber"}
     one = evaluate(tmp_path / "one.csv", drbpn, **options)
     two = evaluate(tmp_path / "two.csv", drbpn, **options, processes=2)
@@ -140,7 +132,7 @@ def test_two_processes_give_the_numbers_of_one(drbpn: Path, tmp_path: Path) -> N
     assert list(evaluate_tasks([], None, 2)) == []
 
 
-def test_a_table_of_other_settings_is_not_mixed_with(drbpn: Path, tmp_path: Path) -> None:
+def test_a_table_of_other_settings_is_not_mixed_with(drbpn, tmp_path):
     out, points = tmp_path / "out.csv", "'reduction:0.5:random',none:0"
     rows = evaluate(out, drbpn, points=points)
     assert [row["reduction_seed"] for row in rows] == ["0"] * 4 + [""] * 4
@@ -158,9 +150,7 @@ def test_a_table_of_other_settings_is_not_mixed_with(drbpn: Path, tmp_path: Path
     assert [row["mode"] for row in rows] == ["sampled", "mean"]
 
 
-def test_another_study_of_the_same_folder_names_is_not_taken_for_it(
-    drbpn: Path, feedforward: Path, tmp_path: Path
-) -> None:
+def test_another_study_of_the_same_folder_names_is_not_taken_for_it(drbpn, feedforward, tmp_path):
     """Cells are called alike in every study: the name of a folder says nothing of whose it is."""
     out = tmp_path / "out.csv"
     first, second = (tmp_path / study / "hopper-s0" for study in ("robust", "clean"))
@@ -181,7 +171,7 @@ def test_another_study_of_the_same_folder_names_is_not_taken_for_it(
 
 
 @pytest.mark.parametrize("text", ["frames,mechanism\n1,mcar\n", "\x00\x01", ""])
-def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path, text: str) -> None:
+def test_a_foreign_table_is_not_overwritten(drbpn, tmp_path, text):
     out = tmp_path / "out.csv"
     out.write_text(text)
     with pytest.raises(UserError, match=r"no table of this command|can't be read as a table"):
@@ -195,7 +185,7 @@ def test_a_foreign_table_is_not_overwritten(drbpn: Path, tmp_path: Path, text: s
 @pytest.mark.parametrize(
     "name", ["a=b", "a,b", "[ab]", "a b", "it's", 'a"b', "a*", "$HOME", "eta={0.5}", "back\\slash"]
 )
-def test_a_folder_is_found_whatever_its_name_holds(tmp_path: Path, name: str) -> None:
+def test_a_folder_is_found_whatever_its_name_holds(tmp_path, name):
     folder = tmp_path / name
     folder.mkdir()
     (tmp_path / "a").mkdir()
@@ -205,9 +195,7 @@ def test_a_folder_is_found_whatever_its_name_holds(tmp_path: Path, name: str) ->
     assert configured("evaluate", word)["run"] == str(folder)
 
 
-def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(
-    drbpn: Path, feedforward: Path, tmp_path: Path
-) -> None:
+def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(drbpn, feedforward, tmp_path):
     for folder in (drbpn, feedforward):
         shutil.copytree(folder, tmp_path / folder.name)
     (tmp_path / "empty").mkdir()
@@ -219,9 +207,7 @@ def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(
             find_folders(wanted)
 
 
-def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(
-    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(drbpn, tmp_path, capsys):
     young = tmp_path / "young"
     young.mkdir()
     shutil.copy(drbpn / "config.yaml", young)
@@ -235,9 +221,7 @@ def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(
 # Settings -------------------------------------------------------------------------------------
 
 
-def test_the_full_list_of_a_task_without_sensor_names_has_no_groups(
-    agent: TrainedAgent, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_full_list_of_a_task_without_sensor_names_has_no_groups(agent, capsys):
     unnamed = dataclasses.replace(agent, settings=agent.settings.copy())
     unnamed.settings.env.id = "Homemade"
     full = configured("evaluate", "full=true")
@@ -250,8 +234,8 @@ def test_the_full_list_of_a_task_without_sensor_names_has_no_groups(
 
 
 def test_a_robust_update_changes_what_spikes_do_and_its_table_has_a_name_of_its_own(
-    drbpn: Path, feedforward: Path, tmp_path: Path
-) -> None:
+    drbpn, feedforward, tmp_path
+):
     folder = shutil.copytree(drbpn, tmp_path / "run")
     points = "'spikes:1:50'"
     believed = evaluate(tmp_path / "out.csv", folder, points=points)
@@ -268,9 +252,7 @@ def test_a_robust_update_changes_what_spikes_do_and_its_table_has_a_name_of_its_
         recipe.run(base | {"output": str(folder / "points.csv")})
 
 
-def test_an_agent_trained_with_a_robust_update_acts_with_it_unless_told_otherwise(
-    drbpn: Path, tmp_path: Path
-) -> None:
+def test_an_agent_trained_with_a_robust_update_acts_with_it_unless_told_otherwise(drbpn, tmp_path):
     folder = shutil.copytree(drbpn, tmp_path / "run")
     config = folder / "config.yaml"
     text = config.read_text().replace("robust: null", "robust: imq")
@@ -285,7 +267,7 @@ def test_an_agent_trained_with_a_robust_update_acts_with_it_unless_told_otherwis
     ]  # fmt: skip
 
 
-def test_a_figure_has_a_panel_a_family_and_kind_of_action(drbpn: Path, tmp_path: Path) -> None:
+def test_a_figure_has_a_panel_a_family_and_kind_of_action(drbpn, tmp_path):
     points = "none:0,'mcar:0.5','outages:0.5:2','outages:0.5:9','noise:1'"
     evaluate(tmp_path / "out.csv", drbpn, points=points, figures=True)
     assert (tmp_path / "out-InvertedPendulum-v5.png").is_file()

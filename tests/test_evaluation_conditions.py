@@ -5,7 +5,6 @@ A condition names one thing and leaves the rest as in training; its full name re
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,19 +14,18 @@ from evaluation.conditions import default_conditions, removed_sensors
 from evaluation.sensor_choice import kept_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent
 from evaluation_tools import configured, evaluate, parse
-from omegaconf import DictConfig
 from training.errors import UserError
 
 from torchrl_drbpn.functional import draw_mechanism
 
 
 @pytest.fixture(scope="module")
-def agent(drbpn: Path) -> TrainedAgent:
+def agent(drbpn):
     return load_trained_agent(drbpn)
 
 
 @pytest.fixture(scope="module")
-def settings(agent: TrainedAgent) -> DictConfig:
+def settings(agent):
     return agent.settings
 
 
@@ -57,15 +55,13 @@ def settings(agent: TrainedAgent) -> DictConfig:
         ("multi_rate:4:joint:0", "multi_rate:4:joint:0"),
     ],
 )
-def test_the_full_name_of_a_condition_reads_back_to_it(
-    text: str, name: str, settings: DictConfig
-) -> None:
+def test_the_full_name_of_a_condition_reads_back_to_it(text, name, settings):
     condition = parse(text, settings)
     assert condition.name == name
     assert parse(name, settings) == condition
 
 
-def test_a_condition_leaves_what_it_does_not_name_as_in_training(settings: DictConfig) -> None:
+def test_a_condition_leaves_what_it_does_not_name_as_in_training(settings):
     for text in ("noise:3", "spikes:0.1", "stuck:0.1", "drift:1"):
         assert parse(text, settings).missingness == settings.missingness
     for text in ("mar:0.5", "outages:0.5:20", "delay:1", "multi_rate:2", "reduction:0.5:random"):
@@ -81,15 +77,13 @@ def test_a_condition_leaves_what_it_does_not_name_as_in_training(settings: DictC
      "reduction:1.2:model", "mcar:1.5", "delay:-1", "delay:1.5", "delay:3:2", "delay:1:2:sensor:x",
      "multi_rate:0", "multi_rate:2:sensor:2", "stuck:2", "stuck:0.1:0.5", "drift:-1", "drift:nan"],
 )  # fmt: skip
-def test_a_condition_that_can_not_be_read_is_refused(text: str, settings: DictConfig) -> None:
+def test_a_condition_that_can_not_be_read_is_refused(text, settings):
     with pytest.raises(UserError, match="`points` must hold ") as error:
         parse(text, settings)
     assert repr(text) in str(error.value)
 
 
-def test_the_default_conditions_are_those_of_the_paper_and_the_full_ones_go_beyond(
-    settings: DictConfig,
-) -> None:
+def test_the_default_conditions_are_those_of_the_paper_and_the_full_ones_go_beyond(settings):
     levels = configured()["grid"]
     usual = default_conditions(levels, full=False, model=True)
     ratios = ("0.2", "0.4", "0.5", "0.6", "0.8")
@@ -112,7 +106,7 @@ def test_the_default_conditions_are_those_of_the_paper_and_the_full_ones_go_beyo
         parse(text, settings)
 
 
-def test_mean_lengths_that_no_chain_has_are_left_out_and_refused(settings: DictConfig) -> None:
+def test_mean_lengths_that_no_chain_has_are_left_out_and_refused(settings):
     levels = dict.fromkeys(configured()["grid"], ()) | {
         "outage_ratios": [0.8], "outage_lengths": [1, 2, 4, 20], "outage_groups": ["sensor"],
     }  # fmt: skip
@@ -122,7 +116,7 @@ def test_mean_lengths_that_no_chain_has_are_left_out_and_refused(settings: DictC
         parse("outages:0.8:2", settings)
 
 
-def test_each_family_changes_what_the_agent_gets(drbpn: Path, tmp_path: Path) -> None:
+def test_each_family_changes_what_the_agent_gets(drbpn, tmp_path):
     texts = ("noise:0", "outages:0.5:3:kind", "reduction:0.5:random", "reduction:0.5:model")
     late = ("delay:3", "multi_rate:4", "stuck:1:20", "drift:0:1")
     points = ",".join(f"'{text}'" for text in (*texts, *late, "spikes:1:5", "none:0", "mcar:1"))
@@ -131,7 +125,7 @@ def test_each_family_changes_what_the_agent_gets(drbpn: Path, tmp_path: Path) ->
     )  # fmt: skip
     frame = {row["point"]: [r for r in rows if r["point"] == row["point"]] for row in rows}
 
-    def mean(point: str, column: str) -> float:
+    def mean(point, column):
         steps = [int(row["length"]) for row in frame[point]]
         return float(np.average([float(row[column]) for row in frame[point]], weights=steps))
 
@@ -161,9 +155,7 @@ def removed_at_random(ratio: float, trained: TrainedAgent, episodes: int, seed: 
     return removed_sensors(condition, trained, episodes=episodes, reduction_seed=seed)
 
 
-def test_random_reduction_is_the_same_for_every_agent_and_nested(
-    agent: TrainedAgent, feedforward: Path
-) -> None:
+def test_random_reduction_is_the_same_for_every_agent_and_nested(agent, feedforward):
     other = load_trained_agent(feedforward)
     smaller = torch.zeros(30, 4, dtype=torch.bool)
     for ratio, count in ((0.25, 1), (0.5, 2), (1.0, 4)):
@@ -177,7 +169,7 @@ def test_random_reduction_is_the_same_for_every_agent_and_nested(
         removed_sensors(by_model, other, episodes=1, reduction_seed=0)
 
 
-def test_each_episode_lacks_sensors_of_its_own_by_its_number_alone(agent: TrainedAgent) -> None:
+def test_each_episode_lacks_sensors_of_its_own_by_its_number_alone(agent):
     many = removed_at_random(0.5, agent, 400)
     assert torch.equal(removed_at_random(0.5, agent, 3), many[:3])
     assert not torch.equal(removed_at_random(0.5, agent, 400, seed=1), many)
@@ -191,7 +183,7 @@ def test_each_episode_lacks_sensors_of_its_own_by_its_number_alone(agent: Traine
     assert sorted(kept_sensors(agent, 2)) == (~chosen[0]).nonzero().squeeze(-1).tolist()
 
 
-def test_random_reduction_does_not_draw_what_training_never_lost(agent: TrainedAgent) -> None:
+def test_random_reduction_does_not_draw_what_training_never_lost(agent):
     """Both seeds are 0 by default: the always observed sensors must not be those removed."""
     drawn = draw_mechanism("mar", 4, 1, generator=torch.Generator().manual_seed(0))
     both = (removed_at_random(0.25, agent, 400) & drawn.always_observed).any(-1)

@@ -12,7 +12,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +40,8 @@ def exported(run: Path, out: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize("belief", ["drbpn", "drbpn_propagated"])
 @pytest.mark.parametrize(("kind", "name"), KINDS)
 def test_a_file_decides_as_the_agent_with_nan_or_a_mask(
-    trained_run: Callable[..., Path], tmp_path: Path, capsys: Any, belief: str, kind: str, name: str
-) -> None:
+    trained_run, tmp_path, capsys, belief, kind, name
+):
     run = trained_run(belief)
     out = exported(run, tmp_path / name, format=kind, robots=2)
     printed = capsys.readouterr().out
@@ -87,9 +86,8 @@ def test_a_file_decides_as_the_agent_with_nan_or_a_mask(
     ],
 )  # fmt: skip
 def test_what_can_not_be_exported_is_one_line_and_no_file(
-    trained_run: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    belief: str, changes: dict[str, Any], line: str,
-) -> None:  # fmt: skip
+    trained_run, tmp_path, monkeypatch, belief, changes, line
+):
     run = str(trained_run(belief))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=line) as caught:
@@ -98,18 +96,14 @@ def test_what_can_not_be_exported_is_one_line_and_no_file(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_noise_covariance_has_no_onnx_form(
-    trained_run: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_full_noise_covariance_has_no_onnx_form(trained_run, tmp_path):
     run = trained_run("drbpn", "belief.emission.cov=full")
     with pytest.raises(UserError, match="`format=onnx`: `sequential` needs a diagonal emission"):
         exported(run, tmp_path / "p.onnx")
     exported(run, tmp_path / "p.pt2", format="export")
 
 
-def test_a_missing_package_and_a_missing_compiler_are_named(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_and_a_missing_compiler_are_named(drbpn, tmp_path, monkeypatch):
     monkeypatch.setattr(recipe, "PACKAGES", ("numpy", "no_such_onnx"))
     with pytest.raises(UserError, match="needs no_such_onnx: pip install no_such_onnx"):
         exported(drbpn, tmp_path / "p.onnx")
@@ -132,13 +126,13 @@ def walked(script: str, policy: Path) -> float:
     return float(re.findall(r"return (-?\d+)", done.stdout)[0])
 
 
-def test_the_program_without_torch_walks(tmp_path: Path) -> None:
+def test_the_program_without_torch_walks(tmp_path):
     assert walked("control_loop_onnx.py", exported(WALKER, tmp_path / "policy.onnx")) > 3000
 
 
 @pytest.mark.slow
 @compiled
-def test_the_programs_in_python_and_in_c_walk_and_decide(tmp_path: Path) -> None:
+def test_the_programs_in_python_and_in_c_walk_and_decide(tmp_path):
     policy = exported(WALKER, tmp_path / "policy.pt2")
     assert walked("control_loop.py", policy) > 3000
     page = (ROOT / "docs" / "deploy.md").read_text()

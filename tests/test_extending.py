@@ -11,7 +11,6 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
@@ -28,7 +27,7 @@ COMMANDS = re.findall(r"^PYTHONPATH=.* recipes/ppo_drbpn\.py .*$", PAGES, re.MUL
 
 
 @pytest.mark.parametrize("line", COMMANDS, ids=["transform", "belief", "loss", "robot", "nan"])
-def test_a_command_of_the_page_trains_from_anywhere(line: str, tmp_path: Path) -> None:
+def test_a_command_of_the_page_trains_from_anywhere(line, tmp_path):
     from evaluation.trained import load_trained_agent
 
     path, python, *words = shlex.split(line)

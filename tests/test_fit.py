@@ -59,7 +59,7 @@ def write(table: pd.DataFrame, path: Path) -> Path:
 
 # ---------------------------------------------------------------------------------- reading a log
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
-def test_every_kind_of_file_is_the_same_log(tmp_path: Path, suffix: str) -> None:
+def test_every_kind_of_file_is_the_same_log(tmp_path, suffix):
     _, table = logged(3, 6)
     table = table.drop(index=17).sample(frac=1, random_state=0).sort_values("run", kind="stable")
     table.iloc[5, table.columns.get_loc("u0")] = np.nan  # the last of an episode leads nowhere
@@ -126,9 +126,7 @@ def broken(table: pd.DataFrame, how: str) -> pd.DataFrame:
         ("", {"belief": {"pretrained": "x"}}, "`belief.pretrained` is what this command makes"),
     ],
 )  # fmt: skip
-def test_bad_input_is_one_line_and_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, changes: dict[str, Any], line: str
-) -> None:
+def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, how, changes, line):
     monkeypatch.chdir(tmp_path)
     for name in ("log.txt", "broken.npz"):
         Path(name).write_text("no table")
@@ -145,7 +143,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(
 
 
 # ---------------------------------------------------------------------------------------- training
-def test_episodes_are_split_and_every_one_is_somewhere() -> None:
+def test_episodes_are_split_and_every_one_is_somewhere():
     for episodes, sizes in ((2, (1, 1, 1)), (3, (1, 1, 1)), (10, (6, 2, 2)), (50, (30, 10, 10))):
         parts = split(episodes, 0.2, seed=0)
         assert tuple(map(len, parts)) == sizes
@@ -161,7 +159,7 @@ def sequences(system: oracles.LinearSystem, batch: int, time: int, seed: int = 3
     return Sequences(*(x.float() if x.is_floating_point() else x for x in parts))
 
 
-def test_windows_of_a_cut_are_the_sequence_and_its_padding_is_reset() -> None:
+def test_windows_of_a_cut_are_the_sequence_and_its_padding_is_reset():
     data = sequences(oracles.random_system(3, 4), 2, 11)
     windows = data.cut(4)
     assert windows.reset.shape == (6, 4)
@@ -170,7 +168,7 @@ def test_windows_of_a_cut_are_the_sequence_and_its_padding_is_reset() -> None:
     assert windows.reset.reshape(2, 12)[:, 11].all()
 
 
-def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself() -> None:
+def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself():
     """With actions in units of a thousand, which the scale must take out and put back."""
     system = oracles.random_system(3, 4, seed=1)
     train, held = sequences(system, 40, 64), sequences(system, 40, 64, seed=4)
@@ -189,7 +187,7 @@ def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself() ->
     assert after > truth.item() - 0.08 > before
 
 
-def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it() -> None:
+def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it():
     system = oracles.random_system(3, 4, seed=1)
     train, held = sequences(system, 2, 8), sequences(system, 20, 16, seed=4)
     torch.manual_seed(0)
@@ -204,15 +202,13 @@ def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it() -> N
     assert after == pytest.approx(best, abs=2e-3)
 
 
-def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(monkeypatch):
     data = sequences(oracles.random_system(3, 4), 2, 12)
     torch.manual_seed(0)
     belief_filter = BeliefFilter(4, 2, 3, covariance="propagated")
     calls: list[tuple[Any, ...]] = []
 
-    def watched(own: BeliefFilter, given: Sequences, before: Any = None) -> Any:
+    def watched(own, given, before=None):
         jacobian = own.mean_jacobian.clone()
         out = run(own, given, before)
         f = own.transition.mean_network()
@@ -234,7 +230,7 @@ def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(
             torch.testing.assert_close(found[row], last)
 
 
-def test_the_weights_of_the_transition_alone_decay() -> None:
+def test_the_weights_of_the_transition_alone_decay():
     data = sequences(oracles.random_system(3, 4), 2, 8)
     belief_filter = BeliefFilter(4, 2, 3)
     options = {"length": 8, "batch_size": 2, "max_grad_norm": 1.0, "patience": 1, "seed": 0}
@@ -245,7 +241,7 @@ def test_the_weights_of_the_transition_alone_decay() -> None:
     assert belief_filter.emission.matrix.diagonal().min() > 0.9
 
 
-def test_the_last_value_of_a_sensor_is_what_it_showed_last_and_zero_before() -> None:
+def test_the_last_value_of_a_sensor_is_what_it_showed_last_and_zero_before():
     data = sequences(oracles.random_system(3, 4), 2, 8)
     found = fitting.estimates({"filter": BeliefFilter(4, 2, 3)}, data)["last value"].mean
     last = torch.zeros(2, 4)
@@ -254,7 +250,7 @@ def test_the_last_value_of_a_sensor_is_what_it_showed_last_and_zero_before() -> 
         assert torch.equal(found[:, t], last)
 
 
-def test_what_is_hidden_was_there_and_is_the_share_asked_for_in_stretches() -> None:
+def test_what_is_hidden_was_there_and_is_the_share_asked_for_in_stretches():
     observed = torch.rand(40, 200, 5) < 0.8
     hidden = hide(observed, 0.3, 10.0, seed=0)
     assert not (hidden & ~observed).any()
@@ -267,7 +263,7 @@ def test_what_is_hidden_was_there_and_is_the_share_asked_for_in_stretches() -> N
 
 # ----------------------------------------------------------------------------------- the command
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fitted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fit")
     data = write(logged(20, 50)[1], folder / "log.csv")
     config = configured("fit", "belief.transition.hidden_sizes=[16]") | {
@@ -278,9 +274,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
-def test_the_table_holds_every_method_and_component_and_the_last_value_is_behind(
-    fitted: Path,
-) -> None:
+def test_the_table_holds_every_method_and_component_and_the_last_value_is_behind(fitted):
     assert {path.name for path in fitted.iterdir()} == {
         "table.csv", "estimates.png", "filter.safetensors",
     }  # fmt: skip
@@ -303,9 +297,7 @@ def agent_of(*words: str) -> dict[str, torch.Tensor]:
     return training.agent.state_dict()
 
 
-def test_an_agent_starts_from_the_filter_and_its_normalisation(
-    fitted: Path, tmp_path: Path
-) -> None:
+def test_an_agent_starts_from_the_filter_and_its_normalisation(fitted, tmp_path):
     """InvertedPendulum has four sensors too, and one action."""
     table = logged(4, 20)[1]
     config = configured("fit") | {

@@ -19,7 +19,7 @@ NUMBERS = {"lr": 1.0, "momentum": 0.0, "damping": 1e-12, "decay": 0.9, "max_kl":
 
 
 @pytest.fixture
-def generator() -> torch.Generator:
+def generator():
     return torch.Generator().manual_seed(0)
 
 

@@ -36,7 +36,7 @@ SMALL = {"start": 0, "steps": 6, "sensors": 2, "window": 4, "size": 240, "robot"
 
 
 @pytest.fixture(scope="module")
-def recording(drbpn: Path) -> Recording:
+def recording(drbpn):
     return record(drbpn)
 
 
@@ -72,7 +72,7 @@ def pixels_of(film: Film, panel: int, row: float, window: int = 4) -> tuple[Any,
 # The recording --------------------------------------------------------------------------------
 
 
-def test_a_recording_is_the_first_episode_of_an_evaluation(drbpn: Path, tmp_path: Path) -> None:
+def test_a_recording_is_the_first_episode_of_an_evaluation(drbpn, tmp_path):
     whole = record(drbpn, steps=100_000)
     rows = evaluate(tmp_path / "t.csv", drbpn, points="'mcar:0.5'", seed=4, modes=["sampled"])
     assert len(whole.steps) == int(rows[0]["length"])
@@ -82,9 +82,7 @@ def test_a_recording_is_the_first_episode_of_an_evaluation(drbpn: Path, tmp_path
     np.testing.assert_array_equal(later.estimate, whole.estimate[2:5])
 
 
-def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(
-    drbpn: Path, recording: Recording
-) -> None:
+def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(drbpn, recording):
     assert 0 < recording.missing_ratio < 1
     assert (recording.arrived[~recording.observed] == 0).all()
     clean = record(drbpn, "noise:0")
@@ -95,15 +93,13 @@ def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(
     assert np.isnan(record(drbpn, "none:0").coverage)
 
 
-def test_coverage_counts_the_missing_entries_inside_their_interval(recording: Recording) -> None:
+def test_coverage_counts_the_missing_entries_inside_their_interval(recording):
     for std, expected in ((1e6, 1.0), (0.0, 0.0)):
         changed = dataclasses.replace(recording, std=np.full_like(recording.std, std))
         assert changed.coverage == expected
 
 
-def test_the_sensors_that_miss_most_are_chosen_in_the_order_of_the_observation(
-    recording: Recording,
-) -> None:
+def test_the_sensors_that_miss_most_are_chosen_in_the_order_of_the_observation(recording):
     observed = np.ones((5, 4), dtype=bool)
     observed[:3, 3], observed[:2, 1] = False, False
     one = dataclasses.replace(recording, observed=observed)
@@ -114,9 +110,7 @@ def test_the_sensors_that_miss_most_are_chosen_in_the_order_of_the_observation(
 # Files ----------------------------------------------------------------------------------------
 
 
-def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(
-    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(drbpn, tmp_path, capsys):
     out, again = tmp_path / "film.gif", tmp_path / "again.gif"
     for path in (out, again):
         assert show(drbpn, path, point="mcar:0.5", steps=5, every=2, fps=25, size=321) == 0
@@ -130,13 +124,13 @@ def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(
     assert "3 frames of 320 x 200; written" in said
 
 
-def test_without_a_name_the_film_lies_in_the_run_folder(drbpn: Path, tmp_path: Path) -> None:
+def test_without_a_name_the_film_lies_in_the_run_folder(drbpn, tmp_path):
     folder = shutil.copytree(drbpn, tmp_path / "run")
     assert show(folder, None, steps=2) == 0
     assert (folder / "play.gif").is_file()
 
 
-def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path):
     class Broken(list):
         def __iter__(self):
             yield self[0]
@@ -151,9 +145,7 @@ def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_an_mp4_has_the_frames_and_the_size_that_were_asked_for(
-    drbpn: Path, tmp_path: Path
-) -> None:
+def test_an_mp4_has_the_frames_and_the_size_that_were_asked_for(drbpn, tmp_path):
     import imageio_ffmpeg as ffmpeg
 
     out = tmp_path / "film.mp4"
@@ -164,9 +156,7 @@ def test_an_mp4_has_the_frames_and_the_size_that_were_asked_for(
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_a_png_is_the_figure_of_the_belief_the_same_bytes_each_time(
-    drbpn: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_png_is_the_figure_of_the_belief_the_same_bytes_each_time(drbpn, tmp_path, capsys):
     for name in ("a.png", "b.png"):
         assert show(drbpn, tmp_path / name, point="mcar:0.5", start=1) == 0
     assert "the 95 % intervals hold" in capsys.readouterr().out
@@ -179,9 +169,7 @@ def test_a_png_is_the_figure_of_the_belief_the_same_bytes_each_time(
 # Frames ---------------------------------------------------------------------------------------
 
 
-def test_a_frame_shows_masks_and_gaps_up_to_its_step_and_nothing_after(
-    recording: Recording,
-) -> None:
+def test_a_frame_shows_masks_and_gaps_up_to_its_step_and_nothing_after(recording):
     sensor = int((~recording.observed).sum(0).argmax())
     # No band: it may reach over the shading.
     plain = dataclasses.replace(recording, std=np.zeros((6, 4)))
@@ -202,7 +190,7 @@ def test_a_frame_shows_masks_and_gaps_up_to_its_step_and_nothing_after(
         film[6]
 
 
-def test_the_robot_of_each_step_is_in_its_frame(recording: Recording) -> None:
+def test_the_robot_of_each_step_is_in_its_frame(recording):
     greens = [np.full((160, 115, 3), (0, 150 + 20 * i, 0), dtype=np.uint8) for i in range(6)]
     film = make_film(dataclasses.replace(recording, pictures=greens))
     for index in (0, 4):
@@ -210,8 +198,8 @@ def test_the_robot_of_each_step_is_in_its_frame(recording: Recording) -> None:
 
 
 def test_the_robot_is_drawn_where_this_machine_can_and_else_one_line_says_why(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    drbpn, tmp_path, monkeypatch, capsys
+):
     pictures = record(drbpn, steps=2, picture_size=(60, 80)).pictures
     failed = "off-screen rendering failed" in capsys.readouterr().out
     assert failed == (not pictures)
@@ -220,7 +208,7 @@ def test_the_robot_is_drawn_where_this_machine_can_and_else_one_line_says_why(
         assert picture[:5].min() == 255  # no sky: white as the page
         assert picture.min() < 150
 
-    def broken(*_: Any, **__: Any) -> None:
+    def broken(*_, **__):
         raise RuntimeError("no display")
 
     monkeypatch.setattr(trajectory.Camera, "picture", broken)
@@ -236,9 +224,7 @@ class Dial(PendulumEnv):
         return np.full((4, 4, 3), int(100 * self.state[0]), dtype=np.uint8)
 
 
-def test_a_task_that_is_not_mujocos_is_drawn_where_its_state_can_be_set(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_task_that_is_not_mujocos_is_drawn_where_its_state_can_be_set(monkeypatch):
     spec = gymnasium.envs.registration.EnvSpec("Dial-v0", entry_point=Dial)
     monkeypatch.setitem(gymnasium.registry, "Dial-v0", spec)
     camera, simulator = Camera("Dial-v0", (60, 80)), Dial()
@@ -256,7 +242,7 @@ def test_a_task_that_is_not_mujocos_is_drawn_where_its_state_can_be_set(
 # Points and beliefs ---------------------------------------------------------------------------
 
 
-def test_a_point_may_take_sensors_away_for_good(drbpn: Path, tmp_path: Path) -> None:
+def test_a_point_may_take_sensors_away_for_good(drbpn, tmp_path):
     assert show(drbpn, tmp_path / "film.gif", point="reduction:0.5:random", steps=3) == 0
     with Image.open(tmp_path / "film.gif") as video:
         video.seek(2)
@@ -274,8 +260,8 @@ def test_a_point_may_take_sensors_away_for_good(drbpn: Path, tmp_path: Path) -> 
     [("none", "nothing", False), ("fill", "estimate", False), ("gru", "forecast", True)],
 )
 def test_another_belief_shows_what_it_says_and_no_more(
-    trained_run: Any, tmp_path: Path, belief: str, kind: str, has_interval: bool
-) -> None:
+    trained_run, tmp_path, belief, kind, has_interval
+):
     other = trained_run(belief)
     recording = record(other)
     assert recording.kind == kind
@@ -288,27 +274,27 @@ def test_another_belief_shows_what_it_says_and_no_more(
 # Bad input ------------------------------------------------------------------------------------
 
 
-def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(drbpn: Path) -> None:
+def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(drbpn):
     length = len(record(drbpn, steps=100_000).steps)
     with pytest.raises(UserError, match=f"`start` must lie .* after {length} steps"):
         show(drbpn, drbpn / "film.gif", point="mcar:0.5", start=length + 2, window=10)
 
 
 def test_an_mp4_without_its_package_is_refused_before_anything_is_done(
-    drbpn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    drbpn, tmp_path, monkeypatch
+):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None)
     with pytest.raises(UserError, match=r"needs imageio-ffmpeg: .* film.gif"):
         show(drbpn, tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())
 
 
-def test_the_camera_follows_the_robot() -> None:
+def test_the_camera_follows_the_robot():
     walker: Any = gymnasium.make("Walker2d-v5").unwrapped
     walker.reset(seed=0)
     camera = Camera("Walker2d-v5", (96, 128))
 
-    def coloured_pixels(x: float) -> int:
+    def coloured_pixels(x):
         position = walker.data.qpos.copy()
         position[0] = x
         walker.set_state(position, walker.data.qvel)

@@ -21,7 +21,7 @@ import pytest
 import torch
 from analysis.sensor_figures import mean_places, random_orders
 from evaluation.sensor_choice import SensorModel, kept_sensors, learned_sensors
-from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation.trained import load_trained_agent
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 from tensordict import TensorDict
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*out of date.*")
 
 
 @pytest.fixture(scope="module")
-def runs(trained_run: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def runs(trained_run, tmp_path_factory):
     """Three training seeds on Hopper, with names of their folders, and one without a model."""
     root = tmp_path_factory.mktemp("sensors")
     kinds = [("drbpn", *HOPPER, f"seed={seed}") for seed in range(3)] + [("none", *HOPPER)]
@@ -47,12 +47,12 @@ def runs(trained_run: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Pat
 
 
 @pytest.fixture(scope="module")
-def agents(runs: list[Path]) -> list[TrainedAgent]:
+def agents(runs):
     return [load_trained_agent(folder) for folder in runs[:3]]
 
 
 @pytest.fixture(scope="module")
-def models(agents: list[TrainedAgent]) -> list[SensorModel]:
+def models(agents):
     return [learned_sensors(trained) for trained in agents]
 
 
@@ -71,9 +71,7 @@ def filtered(model: SensorModel, rows: list[int]) -> torch.Tensor:
 # The model --------------------------------------------------------------------------------------
 
 
-def test_the_observation_covariance_is_that_of_a_step_inside_an_episode(
-    agents: list[TrainedAgent], models: list[SensorModel]
-) -> None:
+def test_the_observation_covariance_is_that_of_a_step_inside_an_episode(agents, models):
     module = BeliefFilterModule(
         agents[0].agent.belief.filter, out_keys=[("belief", "innovation_cov")]
     )
@@ -93,7 +91,7 @@ def test_the_observation_covariance_is_that_of_a_step_inside_an_episode(
     torch.testing.assert_close(said.double(), models[0].observation_cov, rtol=1e-4, atol=1e-7)
 
 
-def test_spikes_count_as_noise_that_was_added(agents: list[TrainedAgent]) -> None:
+def test_spikes_count_as_noise_that_was_added(agents):
     """A spike of deviation tau that hits with probability p adds p tau^2 to the variance."""
     quiet, settings = learned_sensors(agents[0]).added_std, agents[0].settings
     spikes = {"spike_probability": 0.25, "spike_std": 0.02 * 3**0.5}
@@ -106,16 +104,14 @@ def test_spikes_count_as_noise_that_was_added(agents: list[TrainedAgent]) -> Non
 # The choice -------------------------------------------------------------------------------------
 
 
-def test_the_kept_sensors_are_the_first_of_the_ranking(
-    agents: list[TrainedAgent], models: list[SensorModel]
-) -> None:
+def test_the_kept_sensors_are_the_first_of_the_ranking(agents, models):
     ranking = models[0].ranking("D").tolist()
     assert sorted(ranking) == list(range(OBS))
     for count in (0, 1, OBS):
         assert kept_sensors(agents[0], count) == ranking[:count]
 
 
-def test_a_covariance_that_depends_on_the_state_ranks_no_sensors(runs: list[Path]) -> None:
+def test_a_covariance_that_depends_on_the_state_ranks_no_sensors(runs):
     trained = load_trained_agent(runs[0])
     trained.agent.belief.filter.transition = GaussianTransition(OBS, ACTION, cov_network=True)
     with pytest.raises(UserError, match="`belief=drbpn` predicts another covariance at every"):
@@ -126,7 +122,7 @@ def test_a_covariance_that_depends_on_the_state_ranks_no_sensors(runs: list[Path
 
 
 @pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
-def test_along_an_order_is_what_update_leaves(models: list[SensorModel], full: bool) -> None:
+def test_along_an_order_is_what_update_leaves(models, full):
     model = models[1]
     if full:
         noise = LinearGaussianEmission(OBS, OBS, ACTION, cov="full", dtype=torch.float64)
@@ -147,7 +143,7 @@ def test_along_an_order_is_what_update_leaves(models: list[SensorModel], full: b
             assert left[line, k] == pytest.approx(float(share), abs=1e-9)
 
 
-def test_mean_places_count_from_one(models: list[SensorModel]) -> None:
+def test_mean_places_count_from_one(models):
     places = mean_places(models[:1], "D")
     assert sorted(places) == list(range(1, OBS + 1))
     assert places[models[0].ranking("D")[0]] == 1
@@ -165,9 +161,7 @@ def draw(run: Any, out: Path | None, **changes: Any) -> int:
     return plot_sensors.run(base | {"dpi": 50} | changes)
 
 
-def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(
-    runs: list[Path], tmp_path: Path
-) -> None:
+def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(runs, tmp_path):
     out = tmp_path / "new" / "sensors"
     assert draw([str(runs[1]), str(runs[0])], out) == 0
     assert sorted(path.name for path in out.iterdir()) == FILES
@@ -184,9 +178,7 @@ def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(
         assert part.variance_left.is_monotonic_decreasing
 
 
-def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(
-    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(runs, tmp_path, capsys):
     young = tmp_path / "young"
     young.mkdir()
     shutil.copy(runs[0] / "config.yaml", young)
@@ -201,7 +193,7 @@ def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(
     assert not (tmp_path / "none").exists()
 
 
-def test_methods_are_drawn_apart(agents: list[TrainedAgent]) -> None:
+def test_methods_are_drawn_apart(agents):
     settings = OmegaConf.merge(agents[0].settings, {"method": "ppo_ours"})
     named = replace(agents[0], settings=settings)
     assert plot_sensors.title(named).startswith("Hopper-v4, ppo_ours\n")
@@ -209,9 +201,7 @@ def test_methods_are_drawn_apart(agents: list[TrainedAgent]) -> None:
     assert plot_sensors.title(agents[0]) == plot_sensors.title(agents[1])
 
 
-def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(
-    runs: list[Path], tmp_path: Path
-) -> None:
+def test_one_run_is_drawn_into_its_folder_the_same_bytes_each_time(runs, tmp_path):
     copied = shutil.copytree(runs[0], tmp_path / "run")
     written = []
     for _ in range(2):

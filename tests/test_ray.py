@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -17,26 +14,26 @@ from training.errors import EnvironmentFault, UserError
 RAY = ("experiment=smoke", "collector=ray", "evaluation.every_frames=0")
 
 
-def test_without_ray_the_pip_command_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_the_pip_command_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"`collector=ray` needs Ray: pip install 'ray>=2.60'"):
         assembled(*RAY)
 
 
-def test_workers_must_share_the_simulators_evenly() -> None:
+def test_workers_must_share_the_simulators_evenly():
     with pytest.raises(UserError, match=r"must divide `collector.num_envs`, got 3 and 4"):
         assembled(*RAY, "collector.workers=3")
 
 
 @pytest.mark.slow
-def test_an_address_that_does_not_answer_is_one_line() -> None:
+def test_an_address_that_does_not_answer_is_one_line():
     with pytest.raises(UserError, match=r"127.0.0.1:1`: no Ray cluster answers there") as caught:
         assembled(*RAY, "collector.address=127.0.0.1:1")
     assert "\n" not in str(caught.value)
 
 
 @pytest.fixture
-def cluster() -> Iterator[Any]:
+def cluster():
     """A Ray cluster of two nodes with a processor each."""
     import ray
     from ray.cluster_utils import Cluster
@@ -49,9 +46,7 @@ def cluster() -> Iterator[Any]:
 
 
 @pytest.mark.slow
-def test_a_run_on_two_nodes_learns_and_a_dead_worker_ends_it_saved(
-    cluster: Any, tmp_path: Path
-) -> None:
+def test_a_run_on_two_nodes_learns_and_a_dead_worker_ends_it_saved(cluster, tmp_path):
     """A worker fills a node; its policy is the learner's; a run goes on with new workers."""
     import ray
 

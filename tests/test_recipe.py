@@ -12,7 +12,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -38,7 +37,7 @@ from training.run_folder import read_config
 # What a run leaves ----------------------------------------------------------------------------
 
 
-def test_a_run_leaves_configuration_tables_checkpoints_and_versions(smoke: Path) -> None:
+def test_a_run_leaves_configuration_tables_checkpoints_and_versions(smoke):
     assert read_config(smoke)["missingness"]["eta"] == 0.2
     metrics = read_table(smoke / "metrics.csv")
     assert [int(row["frames"]) for row in metrics] == [128, 256, 384, 512]
@@ -55,7 +54,7 @@ def test_a_run_leaves_configuration_tables_checkpoints_and_versions(smoke: Path)
     assert not list(smoke.rglob(".*.tmp*"))
 
 
-def test_each_finished_episode_is_a_row_with_its_raw_return(smoke: Path) -> None:
+def test_each_finished_episode_is_a_row_with_its_raw_return(smoke):
     episodes = read_table(smoke / "episodes.csv")
     assert len(episodes) == int(read_table(smoke / "metrics.csv")[-1]["episodes"])
     # The pendulum earns 1 a step and nothing for the step in which it falls.
@@ -71,21 +70,19 @@ def test_each_finished_episode_is_a_row_with_its_raw_return(smoke: Path) -> None
         ("mlflow", "mlflow.db", []),
     ],
 )
-def test_a_logger_by_name_writes_its_file(
-    tmp_path: Path, name: str, file: str, words: list[str]
-) -> None:
+def test_a_logger_by_name_writes_its_file(tmp_path, name, file, words):
     pytest.importorskip(name)
     run(tmp_path / "run", *SMOKE, f"logger={name}", "total_frames=128", *words)
     assert list((tmp_path / "run").glob(file))
 
 
-def test_the_statistics_are_constant_while_a_rollout_is_collected_and_learned_from() -> None:
+def test_the_statistics_are_constant_while_a_rollout_is_collected_and_learned_from():
     training, config = assembled(*SMOKE)
     train_rollout(training, config)
     counts = []
     update = training.algorithm.update
 
-    def watched(data: Any, remaining: float) -> dict[str, float]:
+    def watched(data, remaining):
         counts.append(training.agent.norm.count.clone())
         # What the policy stored is what the loss reads, to the bit.
         again = training.agent.norm(data.select("observation", "observed"))
@@ -100,9 +97,7 @@ def test_the_statistics_are_constant_while_a_rollout_is_collected_and_learned_fr
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
-def test_a_logger_that_is_not_installed_is_one_line_and_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_a_logger_that_is_not_installed_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, name):
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(UserError, match=rf"`logger={name}` .*: pip install {name}\.$"):
         run(tmp_path / "run", *SMOKE, f"logger={name}")
@@ -112,7 +107,7 @@ def test_a_logger_that_is_not_installed_is_one_line_and_leaves_nothing(
 # One seed, one result -------------------------------------------------------------------------
 
 
-def test_one_seed_gives_one_result_and_another_seed_another(smoke: Path, tmp_path: Path) -> None:
+def test_one_seed_gives_one_result_and_another_seed_another(smoke, tmp_path):
     run(tmp_path / "again", *SMOKE)
     assert_same_run(smoke, tmp_path / "again")
     run(tmp_path / "other", *SMOKE, "seed=1", "total_frames=128")
@@ -120,7 +115,7 @@ def test_one_seed_gives_one_result_and_another_seed_another(smoke: Path, tmp_pat
     assert read_table(smoke / "metrics.csv")[:1] != other
 
 
-def test_evaluation_leaves_the_whole_training_alone() -> None:
+def test_evaluation_leaves_the_whole_training_alone():
     training, config = assembled(*SMOKE)
     train_rollout(training, config)
     before = saved(training.state_dict())
@@ -134,7 +129,7 @@ def test_evaluation_leaves_the_whole_training_alone() -> None:
 # The command line ------------------------------------------------------------------------------
 
 
-def test_the_command_runs_from_any_directory(tmp_path: Path) -> None:
+def test_the_command_runs_from_any_directory(tmp_path):
     words = ("experiment=smoke", "total_frames=128", "evaluation.final_episodes=1")
     done = command("ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -154,9 +149,7 @@ def test_the_command_runs_from_any_directory(tmp_path: Path) -> None:
         (["hydra.run.dir=/proc/below"], "`/proc/below` can't be used: "),  # not writable
     ],
 )
-def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(
-    tmp_path: Path, words: list[str], line: str
-) -> None:
+def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(tmp_path, words, line):
     done = command("ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
@@ -166,9 +159,7 @@ def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(
     assert not done.stdout
 
 
-def test_runs_that_start_in_the_same_second_have_folders_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
     from training.config import new_folder
 
     monkeypatch.chdir(tmp_path)
@@ -177,7 +168,7 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own(
     assert all(Path(name).is_dir() for name in names)
 
 
-def test_the_progress_bar_has_room_on_100_columns() -> None:
+def test_the_progress_bar_has_room_on_100_columns():
     row = {"return": -1234.5, "missing_ratio": 0.512, "log_likelihood": -12.34,
            "steps_per_second": 12345.6, "frames": 900_000}  # fmt: skip
     file = io.StringIO()
@@ -191,7 +182,7 @@ def test_the_progress_bar_has_room_on_100_columns() -> None:
 
 
 @pytest.mark.slow
-def test_a_closed_pipe_does_not_stop_a_run(tmp_path: Path) -> None:
+def test_a_closed_pipe_does_not_stop_a_run(tmp_path):
     words = [*SMOKE, "total_frames=256", "hydra.run.dir=run", "evaluation.every_frames=0"]
     job = subprocess.Popen(
         [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), *words],
@@ -218,10 +209,10 @@ def improvement(folder: Path, *overrides: str) -> float:
 
 
 @pytest.mark.slow
-def test_the_agent_learns_to_balance_with_a_fifth_of_its_sensors_missing(tmp_path: Path) -> None:
+def test_the_agent_learns_to_balance_with_a_fifth_of_its_sensors_missing(tmp_path):
     assert improvement(tmp_path / "run") >= 5
 
 
 @pytest.mark.slow
-def test_without_learning_the_returns_do_not_rise(tmp_path: Path) -> None:
+def test_without_learning_the_returns_do_not_rise(tmp_path):
     assert improvement(tmp_path / "run", "optim.lr=0") < 2

@@ -38,7 +38,7 @@ def settings_of(name: str) -> DictConfig:
 
 class TestEveryBelief(RecipeBeliefContract):
     @pytest.fixture(autouse=True, params=[*BELIEFS, *FURTHER])
-    def _name(self, request: pytest.FixtureRequest) -> None:
+    def _name(self, request):
         self.name = request.param
 
     def make_belief(self, obs: int = OBS, action: int = ACTION) -> Belief:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-from pathlib import Path
 
 import pytest
 from ppo_drbpn import train_rollout
@@ -28,22 +27,20 @@ LINE = "InvertedPendulum-v5 can't save its state here: going on with new episode
 
 
 @pytest.fixture(scope="module")
-def half(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def half(tmp_path_factory):
     """Run the first half of the smoke experiment once."""
     folder = tmp_path_factory.mktemp("run") / "half"
     assert run(folder, *SMOKE, "total_frames=256") == 0
     return folder
 
 
-def test_one_seed_gives_one_result_whatever_the_threads(half: Path, tmp_path: Path) -> None:
+def test_one_seed_gives_one_result_whatever_the_threads(half, tmp_path):
     run(tmp_path / "again", *SMOKE, "total_frames=256", "env.num_threads=2")
     for table in ("metrics.csv", "episodes.csv", "evaluation.csv"):
         assert read_table(half / table) == read_table(tmp_path / "again" / table), table
 
 
-def test_a_resumed_run_says_in_one_line_that_it_goes_on_with_new_episodes(
-    half: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_resumed_run_says_in_one_line_that_it_goes_on_with_new_episodes(half, tmp_path, capsys):
     folders = [shutil.copytree(half, tmp_path / name) for name in "ab"]
     for folder in folders:
         assert resume(folder, "total_frames=512") == 0
@@ -54,7 +51,7 @@ def test_a_resumed_run_says_in_one_line_that_it_goes_on_with_new_episodes(
     assert differences(first, second) == []
 
 
-def test_all_but_the_episodes_is_restored_and_the_first_ones_are_not_repeated() -> None:
+def test_all_but_the_episodes_is_restored_and_the_first_ones_are_not_repeated():
     training, config = assembled(*SMOKE)
     start = training.collector._carrier["observation"].clone()
     train_rollout(training, config)
@@ -75,7 +72,7 @@ def test_all_but_the_episodes_is_restored_and_the_first_ones_are_not_repeated() 
     assert not (carrier["observation"] == start).all(-1).any()
 
 
-def test_without_envpool_the_answer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_envpool_the_answer_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "envpool", None)
     with pytest.raises(UserError, match=r"pip install 'torchrl-drbpn\[envpool\]'") as error:
         assembled(*SMOKE)

@@ -6,27 +6,17 @@ It ends in one line that says at which step, and what was saved is good.
 from __future__ import annotations
 
 import re
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from ppo_drbpn import train_rollout
-from recipe_tools import (
-    SMOKE,
-    assembled,
-    read_table,
-    resume,
-    run,
-)
+from recipe_tools import SMOKE, assembled, read_table, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.errors import DivergedError, UserError
 
 
 @pytest.mark.parametrize("belief", ["drbpn", "gru", "none"])
-def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(
-    tmp_path: Path, belief: str
-) -> None:
+def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(tmp_path, belief):
     folder = tmp_path / "run"
     with pytest.raises(
         UserError, match=r"training stopped at 0 steps: .*(nan|inf|no longer finite)"
@@ -38,14 +28,12 @@ def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(
     assert not read_table(folder / "evaluation.csv")
 
 
-def test_a_run_that_diverges_later_names_its_last_good_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_diverges_later_names_its_last_good_checkpoint(tmp_path, monkeypatch):
     import ppo_drbpn
 
     collect = ppo_drbpn.collect
 
-    def spoilt(training: Any) -> Any:
+    def spoilt(training):
         if training.frames == 256:
             with torch.no_grad():
                 next(training.agent.critic.parameters())[0] = torch.inf
@@ -69,18 +57,18 @@ def test_a_run_that_diverges_later_names_its_last_good_checkpoint(
     ],
 )
 def test_a_fault_of_the_environment_ends_in_one_line_and_a_saved_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, line: str
-) -> None:
+    tmp_path, monkeypatch, fault, line
+):
     import ppo_drbpn
 
     collect, calls = ppo_drbpn.collect, []
 
-    def faulty(training: Any) -> Any:
+    def faulty(training):
         calls.append(1)
         if len(calls) == 4:  # the first gives statistics alone
             rollout = training.collector.rollout
 
-            def broken() -> Any:
+            def broken():
                 if fault == "raise":
                     raise RuntimeError("motor\non fire")
                 data = rollout()
@@ -101,14 +89,12 @@ def test_a_fault_of_the_environment_ends_in_one_line_and_a_saved_run(
     assert len(read_table(folder / "metrics.csv")) == 4
 
 
-def test_an_engine_that_resets_itself_is_counted_and_said_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_engine_that_resets_itself_is_counted_and_said_once(tmp_path, monkeypatch, capsys):
     import ppo_drbpn
 
     collect = ppo_drbpn.collect
 
-    def wild(training: Any) -> Any:
+    def wild(training):
         if 0 < training.frames < 384:
             training.env.base_env.envs[1].unwrapped.data.qvel[0] = 1e12
         return collect(training)
@@ -122,7 +108,7 @@ def test_an_engine_that_resets_itself_is_counted_and_said_once(
     assert "Warning" not in printed
 
 
-def test_a_weight_that_is_none_is_named() -> None:
+def test_a_weight_that_is_none_is_named():
     training, config = assembled(*SMOKE)
     with torch.no_grad():
         training.agent.critic.module[0].bias[3] = torch.inf

@@ -104,7 +104,7 @@ def row(table: Any, point: str, mode: str = "sampled", **where: Any) -> Any:
 
 
 @pytest.fixture
-def seeds(tmp_path: Path) -> list[Path]:
+def seeds(tmp_path):
     """Three seeds of one method: 40, 50, 90."""
     finals = enumerate((40.0, 50.0, 90.0))
     return [make_run(tmp_path / "runs" / f"s{i}", seed=i, final=value) for i, value in finals]
@@ -113,7 +113,7 @@ def seeds(tmp_path: Path) -> list[Path]:
 # Statistics -------------------------------------------------------------------------------------
 
 
-def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side() -> None:
+def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side():
     values = np.array([[100.0, 1.0, 2.0, 3.0], [-7.0, 5.0, 5.0, 90.0]])
     assert interquartile_mean(values).tolist() == [2.5, 5.0]
     assert interquartile_mean(np.array([1.0, 2.0, 6.0])) == 3.0  # of three none is left out
@@ -121,21 +121,21 @@ def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side() -> None:
     assert interquartile_mean(eight[:3], eight[3:]) == eight[2:6].mean()
 
 
-def test_the_interval_of_few_runs_is_their_range_and_of_one_run_nothing() -> None:
+def test_the_interval_of_few_runs_is_their_range_and_of_one_run_nothing():
     # One of 27 resamples is three times the lowest run: more than one in forty.
     assert interval([6.0, 1.0, 2.0]) == (1.0, 6.0)
     assert interval([6.0, 1.0]) == (1.0, 6.0)
     assert np.isnan(interval([6.0])).all()
 
 
-def test_runs_are_resampled_within_their_task_and_curves_as_a_whole() -> None:
+def test_runs_are_resampled_within_their_task_and_curves_as_a_whole():
     assert interval([1.0, 1.0], [5.0, 5.0]) == (3.0, 3.0)
     curves = np.array([[1.0, 2.0, 4.0], [5.0, 6.0, 4.0]])
     low, high = interval(curves)
     assert [(low[i], high[i]) for i in (0, 1)] == [interval(curve) for curve in curves]
 
 
-def test_the_probability_of_improvement_counts_pairs() -> None:
+def test_the_probability_of_improvement_counts_pairs():
     first, second = np.array([3.0, 5.0]), np.array([1.0, 3.0, 9.0])
     # Of six pairs 3 > 1, 5 > 1, 5 > 3 are won and 3 = 3 is half won.
     assert probability_of_improvement(first, second) == pytest.approx(3.5 / 6)
@@ -147,14 +147,14 @@ def test_the_probability_of_improvement_counts_pairs() -> None:
 # Names ------------------------------------------------------------------------------------------
 
 
-def test_a_run_is_called_by_its_belief_unless_it_is_named() -> None:
+def test_a_run_is_called_by_its_belief_unless_it_is_named():
     config = composed("belief=gru")
     assert method_name(config) == "gru"
     assert method_name({**config} | {"method": "mine"}) == "mine"
     assert method_name(composed("belief=gru", "algo=acktr")) == "gru (acktr)"
 
 
-def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it() -> None:
+def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it():
     assert point_kind("reduction:0.5:random") == ("reduction random", 0.5)
     assert point_kind("outages:0.5:20:joint") == ("outages 0.5 joint", 20.0)
     assert point_kind("spikes:0.05:5") == ("spikes 5", 0.05)
@@ -168,7 +168,7 @@ def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it() -> None:
 # Tables -----------------------------------------------------------------------------------------
 
 
-def test_means_over_seeds_stand_beside_every_seeds_own_number(seeds: list[Path]) -> None:
+def test_means_over_seeds_stand_beside_every_seeds_own_number(seeds):
     summary = tables(seeds)["summary"]
     training = row(summary, "training")
     assert (training["return"], training.low, training.high) == (60, 40, 90)
@@ -178,7 +178,7 @@ def test_means_over_seeds_stand_beside_every_seeds_own_number(seeds: list[Path])
     assert row(summary, "mar:0.5", "mean")["return"] == 60  # the run's own, at the end
 
 
-def test_a_share_is_a_ratio_of_means(tmp_path: Path) -> None:
+def test_a_share_is_a_ratio_of_means(tmp_path):
     points = [
         {"none:0": (90.0, 110.0), "mcar:0.5": (85.0,)},
         {"none:0": (10.0,), "mcar:0.5": (20.0,)},
@@ -189,7 +189,7 @@ def test_a_share_is_a_ratio_of_means(tmp_path: Path) -> None:
     assert half.share == pytest.approx((85 + 20) / (100 + 10))  # not (0.85 + 2) / 2
 
 
-def test_episodes_are_summed_up_over_their_steps() -> None:
+def test_episodes_are_summed_up_over_their_steps():
     table = pd.DataFrame(episodes({"mcar:0.5": (1.0, 2.0)})).assign(missing_ratio=[0.2, 0.6])
     found = over_episodes(table.assign(log_likelihood=[1.0, 2.0], diverged=[0, 1]), ["point"]).iloc[
         0
@@ -199,14 +199,14 @@ def test_episodes_are_summed_up_over_their_steps() -> None:
     assert (found.return_mean, found.diverged, found.episodes) == (1.5, 0.5, 2)
 
 
-def test_a_mean_that_lacks_a_seed_is_not_given(seeds: list[Path]) -> None:
+def test_a_mean_that_lacks_a_seed_is_not_given(seeds):
     (seeds[1] / "robustness.csv").unlink()
     points = set(tables(seeds)["summary"].point)
     assert "mcar:0.5" not in points
     assert "training" in points
 
 
-def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path: Path) -> None:
+def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path):
     folder = make_run(tmp_path / "a")
     write_table(folder / "points.csv", episodes({"mcar:0.5": (1.0, 1.0), "nmar:0.5": (7.0, 7.0)}))
     summary = tables([folder])["summary"]
@@ -214,9 +214,7 @@ def test_a_point_of_two_tables_is_one_evaluation_that_of_the_grid(tmp_path: Path
     assert row(summary, "nmar:0.5")["return"] == 7
 
 
-def test_a_table_over_several_runs_is_read_by_their_names(
-    seeds: list[Path], tmp_path: Path
-) -> None:
+def test_a_table_over_several_runs_is_read_by_their_names(seeds, tmp_path):
     parts = [
         pd.DataFrame(episodes({"noise:3": (value,)})).assign(run=folder.name)
         for value, folder in zip((1.0, 2.0, 6.0), seeds, strict=True)
@@ -226,7 +224,7 @@ def test_a_table_over_several_runs_is_read_by_their_names(
     assert row(summary, "noise:3").per_seed == "0=1 1=2 2=6"
 
 
-def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path: Path) -> None:
+def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path):
     kinds = [(), ("optim.lr=0.1",), ("missingness.eta=0.2",), ("noise.sigma=3",), ("env=ant",)]
     kinds += [("loss.model_coeff=0", "method=ppo_ours"), ("noise=spikes",)]
     folders = [
@@ -242,14 +240,14 @@ def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path: Path) 
     assert training[training["return"] == 50.0].method.tolist() == ["ppo_ours"]
 
 
-def test_settings_that_follow_the_seed_are_no_difference(seeds: list[Path]) -> None:
+def test_settings_that_follow_the_seed_are_no_difference(seeds):
     for seed, folder in enumerate(seeds):
         more = {"collector_seed": seed, "transforms": {"own": {"seed": seed}}}
         write_config(folder, read_config(folder) | more)
     assert row(tables(seeds)["summary"], "training").seeds == 3
 
 
-def test_the_reference_is_compared_where_half_is_missing_and_at_equal_steps(tmp_path: Path) -> None:
+def test_the_reference_is_compared_where_half_is_missing_and_at_equal_steps(tmp_path):
     points = {"none:0": (100.0,), "mcar:0.5": (60.0,)}
     folders = [make_run(tmp_path / f"a{i}", seed=i, final=40.0 + i, points=points) for i in (0, 1)]
     short = ("belief=dvrl", "total_frames=200")
@@ -269,7 +267,7 @@ def test_the_reference_is_compared_where_half_is_missing_and_at_equal_steps(tmp_
     assert (equal.steps, equal.steps_over) == (200, 200)
 
 
-def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Path) -> None:
+def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path):
     folders = [
         make_run(tmp_path / f"{env}{seed}", f"env={env}", seed=seed, points={"none:0": (value,)})
         for env, value in (("hopper", 2000.0), ("walker2d", 1500.0), ("reacher", -5.0))
@@ -280,7 +278,7 @@ def test_over_all_tasks_returns_are_shares_of_the_papers_thresholds(tmp_path: Pa
     assert (score.score, score.low, score.high) == (0.75, 0.75, 0.75)
 
 
-def test_sample_efficiency_counts_within_two_million_steps(tmp_path: Path) -> None:
+def test_sample_efficiency_counts_within_two_million_steps(tmp_path):
     folder = make_run(tmp_path / "a", final=2500.0)
     table = pd.DataFrame({"frames": [*range(1, 12), 3_000_000], "return": [*range(11), 10**6]})
     write_table(folder / "episodes.csv", table)
@@ -289,7 +287,7 @@ def test_sample_efficiency_counts_within_two_million_steps(tmp_path: Path) -> No
     assert runs.steps_to_threshold.item() == 200  # the first row of 100 episodes or more
 
 
-def test_learning_curves_are_thinned_over_the_whole_run(seeds: list[Path]) -> None:
+def test_learning_curves_are_thinned_over_the_whole_run(seeds):
     curve = read_runs(seeds, rows=2).training.query("seed == 1")
     assert curve.frames.tolist() == [200, 400]
     np.testing.assert_allclose(curve.missing_ratio, [0.2, 0.3])
@@ -298,9 +296,7 @@ def test_learning_curves_are_thinned_over_the_whole_run(seeds: list[Path]) -> No
 # Making it again --------------------------------------------------------------------------------
 
 
-def test_the_tables_alone_give_the_same_page_and_keep_the_notes(
-    seeds: list[Path], tmp_path: Path
-) -> None:
+def test_the_tables_alone_give_the_same_page_and_keep_the_notes(seeds, tmp_path):
     out = tmp_path / "out"
     report(seeds, out, title="Three seeds")
     (out / "notes.md").write_text("What to conclude.")
@@ -315,7 +311,7 @@ def test_the_tables_alone_give_the_same_page_and_keep_the_notes(
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_a_page_has_means_intervals_shares_and_what_diverged(tmp_path: Path) -> None:
+def test_a_page_has_means_intervals_shares_and_what_diverged(tmp_path):
     clean = ("experiment=clean", "total_frames=400")
     folders = [make_run(tmp_path / f"s{i}", *clean, seed=i, final=40.0 + i) for i in (0, 1)]
     table = pd.DataFrame(episodes({"none:0": (90.0, 110.0), "mcar:0.5": (80.0, 90.0)}))
@@ -328,9 +324,7 @@ def test_a_page_has_means_intervals_shares_and_what_diverged(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["acktr-v4-1m", "methods-v4-500k"])
-def test_committed_tables_and_pages_are_what_the_committed_runs_give(
-    name: str, tmp_path: Path
-) -> None:
+def test_committed_tables_and_pages_are_what_the_committed_runs_give(name, tmp_path):
     copy = tmp_path / name
     shutil.copytree(ROOT / "results" / name, copy)
     assert run(ASKED | {"from": str(copy)}) == 0
@@ -341,7 +335,7 @@ def test_committed_tables_and_pages_are_what_the_committed_runs_give(
             assert (copy / written).read_text() == committed.read_text(), written
 
 
-def test_results_stay_small() -> None:
+def test_results_stay_small():
     size = sum(path.stat().st_size for path in (ROOT / "results").rglob("*") if path.is_file())
     assert size < 10e6
     assert len(STUDIES) >= 12
@@ -350,8 +344,8 @@ def test_results_stay_small() -> None:
 # The figure of an evaluation --------------------------------------------------------------------
 
 
-def test_an_evaluation_draws_methods_noise_and_runs_of_one_seed_apart() -> None:
-    def rows(run: str, method: str, sigma: float, value: float) -> Any:
+def test_an_evaluation_draws_methods_noise_and_runs_of_one_seed_apart():
+    def rows(run, method, sigma, value):
         table = pd.DataFrame(episodes({"mcar:0.2": (value,), "mcar:0.5": (value,)}, "mean"))
         agent = {"run": run, "env": "Hopper-v4", "method": method, "trained_on": "mar:0.5"}
         return table.assign(**agent, trained_noise_sigma=sigma, noise_sigma=0, training_seed=0)
@@ -372,7 +366,7 @@ def test_an_evaluation_draws_methods_noise_and_runs_of_one_seed_apart() -> None:
 
 
 @pytest.mark.parametrize("panels", [1, 3])
-def test_a_legend_is_as_wide_as_its_figure_and_no_wider(panels: int) -> None:
+def test_a_legend_is_as_wide_as_its_figure_and_no_wider(panels):
     figure, axes = panel_grid(1, panels, (3.0, 2.0))
     for method in range(7):
         axes[0, 0].plot([0, 1], label=f"a method with a long name {method}")
@@ -385,7 +379,7 @@ def test_a_legend_is_as_wide_as_its_figure_and_no_wider(panels: int) -> None:
     assert len(figure.legends) == 1
 
 
-def test_a_run_without_evaluation_or_finished_episode_is_reported(tmp_path: Path) -> None:
+def test_a_run_without_evaluation_or_finished_episode_is_reported(tmp_path):
     folder = make_run(tmp_path / "a", "evaluation.final_episodes=0", points={})
     for name in ("evaluation.csv", "robustness.csv"):
         (folder / name).unlink()
@@ -398,7 +392,7 @@ def test_a_run_without_evaluation_or_finished_episode_is_reported(tmp_path: Path
 # What a user gets wrong -------------------------------------------------------------------------
 
 
-def test_runs_that_are_not_finished_are_refused_unless_asked_for(tmp_path: Path) -> None:
+def test_runs_that_are_not_finished_are_refused_unless_asked_for(tmp_path):
     folder = make_run(tmp_path / "a", frames=[100, 200])
     with pytest.raises(UserError, match=r"`a` has 200 of 400 steps or lacks its final evaluation"):
         report([folder], tmp_path / "out")
@@ -409,9 +403,7 @@ def test_runs_that_are_not_finished_are_refused_unless_asked_for(tmp_path: Path)
         report([folder], tmp_path / "out")
 
 
-def test_a_bad_folder_is_one_line_and_the_old_report_stays(
-    seeds: list[Path], tmp_path: Path
-) -> None:
+def test_a_bad_folder_is_one_line_and_the_old_report_stays(seeds, tmp_path):
     page = report(seeds, tmp_path / "out")
     for name, content, line in (
         ("metrics.csv", "frames,return\n1,2\n", "lacks the columns missing_ratio: is it another"),

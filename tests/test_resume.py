@@ -13,13 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from recipe_tools import (
-    SMOKE,
-    assert_same_run,
-    read_table,
-    resume,
-    run,
-)
+from recipe_tools import SMOKE, assert_same_run, read_table, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.errors import UserError
 
@@ -39,9 +33,7 @@ def copied(smoke: Path, tmp_path: Path) -> Path:
     ],
     ids=["hopper", "outages-spikes", "propagated"],
 )
-def test_a_resumed_run_equals_one_that_never_stopped(
-    overrides: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_resumed_run_equals_one_that_never_stopped(overrides, tmp_path):
     straight = tmp_path / "straight"
     run(straight, "experiment=smoke", *overrides)
     broken = shutil.copytree(straight, tmp_path / "broken")
@@ -56,12 +48,12 @@ def test_a_resumed_run_equals_one_that_never_stopped(
 
 
 @pytest.mark.slow
-def test_a_signal_saves_and_the_resumed_run_equals_one_that_never_stopped(tmp_path: Path) -> None:
+def test_a_signal_saves_and_the_resumed_run_equals_one_that_never_stopped(tmp_path):
     longer = (*SMOKE, "total_frames=2048", "evaluation.every_frames=1024")
     straight, stopped = tmp_path / "straight", tmp_path / "stopped"
     run(straight, *longer)
 
-    def stop() -> None:
+    def stop():
         metrics = stopped / "metrics.csv"
         while not metrics.is_file() or metrics.read_text().count("\n") < 4:
             time.sleep(0.005)
@@ -81,7 +73,7 @@ def test_a_signal_saves_and_the_resumed_run_equals_one_that_never_stopped(tmp_pa
     assert_same_run(straight, stopped)
 
 
-def test_an_evaluation_that_was_cut_short_is_made_again(smoke: Path, tmp_path: Path) -> None:
+def test_an_evaluation_that_was_cut_short_is_made_again(smoke, tmp_path):
     folder = copied(smoke, tmp_path)
     last_checkpoint(folder).unlink()
     state = load_checkpoint(last_checkpoint(folder))
@@ -92,16 +84,14 @@ def test_an_evaluation_that_was_cut_short_is_made_again(smoke: Path, tmp_path: P
     assert_same_run(smoke, folder)
 
 
-def test_resuming_a_finished_run_says_so_and_changes_nothing(
-    smoke: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resuming_a_finished_run_says_so_and_changes_nothing(smoke, tmp_path, capsys):
     folder = copied(smoke, tmp_path)
     assert resume(folder) == 0
     assert "is at its end" in capsys.readouterr().out
     assert_same_run(smoke, folder)
 
 
-def test_a_run_that_lacks_its_final_evaluation_gets_it(smoke: Path, tmp_path: Path) -> None:
+def test_a_run_that_lacks_its_final_evaluation_gets_it(smoke, tmp_path):
     folder = copied(smoke, tmp_path)
     table = folder / "evaluation.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
@@ -109,9 +99,7 @@ def test_a_run_that_lacks_its_final_evaluation_gets_it(smoke: Path, tmp_path: Pa
     assert_same_run(smoke, folder)
 
 
-def test_more_frames_can_be_added_to_a_finished_run_and_none_taken_away(
-    smoke: Path, tmp_path: Path
-) -> None:
+def test_more_frames_can_be_added_to_a_finished_run_and_none_taken_away(smoke, tmp_path):
     folder = copied(smoke, tmp_path)
     assert resume(folder, "total_frames=768") == 0
     rows = read_table(folder / "metrics.csv")

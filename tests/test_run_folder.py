@@ -9,15 +9,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from recipe_tools import (
-    SMOKE,
-    assembled,
-    assert_same_run,
-    make_config,
-    read_table,
-    resume,
-    run,
-)
+from recipe_tools import SMOKE, assembled, assert_same_run, make_config, read_table, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.errors import UserError
 from training.run_folder import Table, read_config
@@ -31,16 +23,14 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_a_second_run_into_a_folder_is_refused_and_the_first_one_stays(smoke: Path) -> None:
+def test_a_second_run_into_a_folder_is_refused_and_the_first_one_stays(smoke):
     before = contents(smoke)
     with pytest.raises(UserError, match=r"holds a run already: .*resume="):
         run(smoke, *SMOKE, "seed=1")
     assert contents(smoke) == before
 
 
-def test_the_command_that_a_refusal_prints_goes_on_with_that_folder(
-    smoke: Path, tmp_path: Path
-) -> None:
+def test_the_command_that_a_refusal_prints_goes_on_with_that_folder(smoke, tmp_path):
     folder = shutil.copytree(smoke, tmp_path / "eta=0.5, [s 0]")
     with pytest.raises(UserError) as error:
         run(folder, *SMOKE)
@@ -48,16 +38,14 @@ def test_the_command_that_a_refusal_prints_goes_on_with_that_folder(
     assert make_config(word).resume == str(folder)
 
 
-def test_a_folder_of_a_run_without_a_checkpoint_is_refused_without_a_promise(
-    smoke: Path, tmp_path: Path
-) -> None:
+def test_a_folder_of_a_run_without_a_checkpoint_is_refused_without_a_promise(smoke, tmp_path):
     folder = copied(smoke, tmp_path)
     shutil.rmtree(folder / "checkpoints")
     with pytest.raises(UserError, match="ended before its first checkpoint: remove it, or name"):
         run(folder, *SMOKE)
 
 
-def test_two_runs_in_one_folder_at_once_are_refused(smoke: Path, tmp_path: Path) -> None:
+def test_two_runs_in_one_folder_at_once_are_refused(smoke, tmp_path):
     folder = copied(smoke, tmp_path)
     with (folder / ".lock").open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -67,7 +55,7 @@ def test_two_runs_in_one_folder_at_once_are_refused(smoke: Path, tmp_path: Path)
     assert resume(folder, "total_frames=640") == 0
 
 
-def test_a_file_where_a_folder_should_be_is_named(tmp_path: Path) -> None:
+def test_a_file_where_a_folder_should_be_is_named(tmp_path):
     (tmp_path / "run").write_text("hello")
     with pytest.raises(UserError, match="can't be a run folder: "):
         run(tmp_path / "run" / "below", *SMOKE)
@@ -82,9 +70,7 @@ def test_a_file_where_a_folder_should_be_is_named(tmp_path: Path) -> None:
         ("config.yaml", "config.yaml"),
     ],
 )
-def test_a_file_for_a_folder_and_a_folder_for_a_file_are_one_line(
-    smoke: Path, tmp_path: Path, name: str, line: str
-) -> None:
+def test_a_file_for_a_folder_and_a_folder_for_a_file_are_one_line(smoke, tmp_path, name, line):
     folder = copied(smoke, tmp_path)
     path = last_checkpoint(folder) if name == "last checkpoint" else folder / name
     if path.is_dir():
@@ -101,9 +87,7 @@ def test_a_file_for_a_folder_and_a_folder_for_a_file_are_one_line(
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"", b"fram\n1\n"], ids=repr)
-def test_a_damaged_table_is_named_and_stays_as_it_is(
-    smoke: Path, tmp_path: Path, content: bytes
-) -> None:
+def test_a_damaged_table_is_named_and_stays_as_it_is(smoke, tmp_path, content):
     folder = copied(smoke, tmp_path)
     (folder / "metrics.csv").write_bytes(content)
     with pytest.raises(UserError, match=r"metrics.csv` (can't be read|must begin).*damaged"):
@@ -113,8 +97,8 @@ def test_a_damaged_table_is_named_and_stays_as_it_is(
 
 @pytest.mark.parametrize("place", [10, 0.3, 0.6, -40], ids=["head", "third", "middle", "end"])
 def test_a_flipped_bit_in_a_checkpoint_is_refused_and_the_one_before_is_named(
-    smoke: Path, tmp_path: Path, place: float
-) -> None:
+    smoke, tmp_path, place
+):
     folder = copied(smoke, tmp_path)
     path = last_checkpoint(folder)
     data = bytearray(path.read_bytes())
@@ -125,9 +109,7 @@ def test_a_flipped_bit_in_a_checkpoint_is_refused_and_the_one_before_is_named(
     assert path.read_bytes() == data
 
 
-def test_a_bit_that_the_archive_does_not_watch_is_seen_by_the_sum_beside_it(
-    smoke: Path, tmp_path: Path
-) -> None:
+def test_a_bit_that_the_archive_does_not_watch_is_seen_by_the_sum_beside_it(smoke, tmp_path):
     path = last_checkpoint(copied(smoke, tmp_path))
     data = bytearray(path.read_bytes())
     data[data.index(b"PK\x01\x02") + 12] ^= 1  # a time of the archive's directory
@@ -138,9 +120,7 @@ def test_a_bit_that_the_archive_does_not_watch_is_seen_by_the_sum_beside_it(
     assert load_checkpoint(path)["progress"]["frames"] == 512
 
 
-def test_a_full_disk_ends_in_one_line_and_the_last_checkpoint_stays(
-    smoke: Path, tmp_path: Path
-) -> None:
+def test_a_full_disk_ends_in_one_line_and_the_last_checkpoint_stays(smoke, tmp_path):
     folder = copied(smoke, tmp_path)
     last_checkpoint(folder).unlink()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -157,9 +137,7 @@ def test_a_full_disk_ends_in_one_line_and_the_last_checkpoint_stays(
     assert_same_run(smoke, folder)
 
 
-def test_what_a_killed_writer_left_is_removed_and_foreign_files_are_left_alone(
-    smoke: Path, tmp_path: Path
-) -> None:
+def test_what_a_killed_writer_left_is_removed_and_foreign_files_are_left_alone(smoke, tmp_path):
     folder = copied(smoke, tmp_path)
     last_checkpoint(folder).unlink()
     stale = [".metrics.csv.7.tmp", "checkpoints/.frames_000000000384.pt.tmp"]
@@ -172,7 +150,7 @@ def test_what_a_killed_writer_left_is_removed_and_foreign_files_are_left_alone(
     assert foreign.read_text() == "half"
 
 
-def test_a_table_drops_what_was_written_after_the_checkpoint(tmp_path: Path) -> None:
+def test_a_table_drops_what_was_written_after_the_checkpoint(tmp_path):
     path = tmp_path / "t.csv"
     table = Table(path, ["frames", "value"])
     table.append([{"frames": 1, "value": None}, {"frames": 2, "value": 5, "more": 6}])
@@ -180,9 +158,7 @@ def test_a_table_drops_what_was_written_after_the_checkpoint(tmp_path: Path) -> 
     assert path.read_text() == "frames,value,new\n1,,\n"
 
 
-def test_a_run_folder_of_the_first_version_is_refused_by_the_commit_that_reads_it(
-    tmp_path: Path,
-) -> None:
+def test_a_run_folder_of_the_first_version_is_refused_by_the_commit_that_reads_it(tmp_path):
     (tmp_path / "config.yaml").write_text("env:\n  name: hopper\n  backend: gymnasium\n")
     with pytest.raises(UserError, match=r"version 0.1.0, which the code of commit 2ebd861 reads"):
         read_config(tmp_path)
@@ -193,7 +169,7 @@ def test_a_run_folder_of_the_first_version_is_refused_by_the_commit_that_reads_i
     [("env=hopper",), ("collector.num_envs=8",), ("heads.hidden=[32,32]",)],
     ids=["another-task", "another-number-of-environments", "other-heads"],
 )
-def test_a_checkpoint_of_another_shape_is_refused(smoke: Path, overrides: tuple[str, ...]) -> None:
+def test_a_checkpoint_of_another_shape_is_refused(smoke, overrides):
     state = load_checkpoint(last_checkpoint(smoke))
     training, _ = assembled(*SMOKE, *overrides)
     with pytest.raises(UserError, match="does not fit the settings of this run") as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import play
@@ -15,7 +14,7 @@ from training.errors import UserError
 
 
 @pytest.fixture(scope="module")
-def finished(trained_run: Any) -> Path:
+def finished(trained_run):
     return trained_run("drbpn", "evaluation.final_episodes=2")
 
 
@@ -23,7 +22,7 @@ def save(run: Any, out: Any) -> int:
     return save_agent.run({"run": run and str(run), "out": out and str(out)})
 
 
-def test_a_saved_agent_acts_as_the_run_did(finished: Path, tmp_path: Path) -> None:
+def test_a_saved_agent_acts_as_the_run_did(finished, tmp_path):
     out = tmp_path / "agents" / "pendulum"
     assert save(finished, out) == 0
     left = {path.name for path in out.iterdir()}
@@ -45,7 +44,7 @@ def test_a_saved_agent_acts_as_the_run_did(finished: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("folder", sorted((ROOT / "agents").iterdir()), ids=lambda path: path.name)
-def test_an_agent_of_the_repository_acts_under_this_code(folder: Path, tmp_path: Path) -> None:
+def test_an_agent_of_the_repository_acts_under_this_code(folder, tmp_path):
     trained = load_trained_agent(folder)
     env = trained.environments()(0)
     with torch.no_grad():
@@ -57,8 +56,8 @@ def test_an_agent_of_the_repository_acts_under_this_code(folder: Path, tmp_path:
 
 
 def test_a_run_folder_is_not_written_into_and_broken_weights_are_one_line(
-    finished: Path, drbpn: Path, tmp_path: Path
-) -> None:
+    finished, drbpn, tmp_path
+):
     with pytest.raises(UserError, match="`out` must be a folder for an agent"):
         save(finished, drbpn)
     save(finished, tmp_path / "agent")

@@ -17,7 +17,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,7 @@ def _keys(groups: tuple[str, ...]) -> set[str]:
 
 
 @pytest.mark.parametrize("study", STUDIES)
-def test_every_cell_of_a_study_is_a_run_in_a_folder_of_its_own(study: str) -> None:
+def test_every_cell_of_a_study_is_a_run_in_a_folder_of_its_own(study):
     every = cells(study)
     names = [folder_of(cell) for cell in every]
     assert len(set(names)) == len(names)
@@ -102,7 +102,7 @@ def test_every_cell_of_a_study_is_a_run_in_a_folder_of_its_own(study: str) -> No
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_method_is_a_belief_with_its_settings_under_its_name(method: str) -> None:
+def test_a_method_is_a_belief_with_its_settings_under_its_name(method):
     config = compose([f"method={method}"])
     assert config.method == method
     assert config.hydra.runtime.choices.belief in (method, "drbpn", "none")
@@ -110,7 +110,7 @@ def test_a_method_is_a_belief_with_its_settings_under_its_name(method: str) -> N
     composed_config([f"method={method}", "experiment=thorough"])
 
 
-def test_the_command_line_wins_over_a_study_and_a_method() -> None:
+def test_the_command_line_wins_over_a_study_and_a_method():
     given = ("seed=7", "env=ant", "method=dvrl", "total_frames=200_000", "optim.lr=1e-4")
     (cell,) = cells("robust", *given, "hydra.sweep.dir=elsewhere")
     assert (cell.seed, cell.env.id, cell.belief.name) == (7, "Ant", "dvrl")
@@ -123,7 +123,7 @@ def test_the_command_line_wins_over_a_study_and_a_method() -> None:
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def done(tmp_path_factory):
     """A run of 200 steps, rounded up to two rollouts of 128."""
     folder = tmp_path_factory.mktemp("sweep") / "cell"
     assert run(folder, *BRIEF) == 0
@@ -131,9 +131,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_cell_that_is_done_is_left_as_it_is(
-    done: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cell_that_is_done_is_left_as_it_is(done, capsys):
     before = {path: path.stat().st_mtime_ns for path in done.rglob("*") if path.suffix}
     assert continued(make_config(*BRIEF), done) is None
     assert capsys.readouterr().out == "cell: done already, left as it is\n"
@@ -141,7 +139,7 @@ def test_a_cell_that_is_done_is_left_as_it_is(
 
 
 @pytest.mark.parametrize("total", [200, 512], ids=["in its final evaluation", "before its end"])
-def test_a_cell_that_was_cut_off_goes_on_to_its_end(done: Path, tmp_path: Path, total: int) -> None:
+def test_a_cell_that_was_cut_off_goes_on_to_its_end(done, tmp_path, total):
     folder = shutil.copytree(done, tmp_path / "cell")
     (folder / "evaluation.csv").unlink()
     config = continued(make_config(*BRIEF, f"total_frames={total}"), folder)
@@ -152,9 +150,7 @@ def test_a_cell_that_was_cut_off_goes_on_to_its_end(done: Path, tmp_path: Path, 
     assert len(read_table(folder / "evaluation.csv")) == 2
 
 
-def test_a_cell_that_was_killed_before_its_first_checkpoint_starts_anew(
-    done: Path, tmp_path: Path
-) -> None:
+def test_a_cell_that_was_killed_before_its_first_checkpoint_starts_anew(done, tmp_path):
     folder = shutil.copytree(done, tmp_path / "cell")
     shutil.rmtree(folder / "checkpoints")
     with (folder / "metrics.csv").open("a") as file:
@@ -166,15 +162,15 @@ def test_a_cell_that_was_killed_before_its_first_checkpoint_starts_anew(
     assert read_table(folder / "metrics.csv") == read_table(done / "metrics.csv")
 
 
-def test_another_configuration_in_the_folder_of_a_cell_is_refused(done: Path) -> None:
+def test_another_configuration_in_the_folder_of_a_cell_is_refused(done):
     with pytest.raises(UserError, match=r"other settings \(seed, optim.lr\): name another folder"):
         continued(make_config(*BRIEF, "seed=1", "optim.lr=0.1"), done)
 
 
 def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken() -> int:
+    tmp_path, monkeypatch
+):
+    def broken():
         raise RuntimeError("two\nlines")
 
     assert run_cell(broken, tmp_path / "cell") == ("cell", "RuntimeError: two lines")
@@ -199,9 +195,7 @@ def sweep(folder: Path, rates: str, launcher: str = "basic") -> subprocess.Compl
 
 
 @pytest.mark.slow
-def test_what_fails_ends_no_other_and_launchers_run_the_same_cells_to_the_same_bit(
-    tmp_path: Path,
-) -> None:
+def test_what_fails_ends_no_other_and_launchers_run_the_same_cells_to_the_same_bit(tmp_path):
     """One cell diverges, one is refused, one is well; one after another, then by each launcher."""
     made = {}
     for launcher in ("basic", "joblib", "submitit_local"):
@@ -219,12 +213,12 @@ def test_what_fails_ends_no_other_and_launchers_run_the_same_cells_to_the_same_b
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+def start(tmp_path):
     """Start a sweep in a process group of its own; nothing of it is left at the end."""
     line = [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), "-m", "study=smoke", *LONG]
     started: list[subprocess.Popen[str]] = []
 
-    def begin(*words: str) -> subprocess.Popen[str]:
+    def begin(*words):
         options: Any = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
         started.append(subprocess.Popen([*line, *words], cwd=tmp_path, **options))
         return started[-1]
@@ -248,13 +242,7 @@ def wait_for_rows(folder: Path, cells: int) -> list[Path]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("launcher", "at_once"), [("basic", 1), ("joblib", 2)])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
-def test_a_signal_stops_a_sweep_and_every_cell_is_saved(
-    start: Callable[..., subprocess.Popen[str]],
-    tmp_path: Path,
-    launcher: str,
-    at_once: int,
-    number: signal.Signals,
-) -> None:
+def test_a_signal_stops_a_sweep_and_every_cell_is_saved(start, tmp_path, launcher, at_once, number):
     """Ctrl-C reaches every process of the terminal, SIGTERM the sweep alone."""
     several = ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
     process = start("seed=0", "method=none,drbpn,gru", f"hydra/launcher={launcher}", *several)
@@ -271,9 +259,7 @@ def test_a_signal_stops_a_sweep_and_every_cell_is_saved(
 
 
 @pytest.mark.slow
-def test_a_sweep_goes_on_after_it_was_killed(
-    start: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_a_sweep_goes_on_after_it_was_killed(start, tmp_path):
     words = ("seed=0", "method=none", "checkpoint.every_frames=128")
     process = start(*words)
     (folder,) = wait_for_rows(tmp_path, 1)

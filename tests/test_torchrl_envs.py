@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -24,7 +23,7 @@ def made(make: Any, num_envs: int = 3, keys: tuple[str, ...] = ("observation",))
     )
 
 
-def test_an_action_beyond_its_limits_is_clipped_and_stored_as_it_was_sampled() -> None:
+def test_an_action_beyond_its_limits_is_clipped_and_stored_as_it_was_sampled():
     rewards = []
     for action in (2.0, 5.0):
         env = made(partial(GymEnv, "Pendulum-v1"))
@@ -45,15 +44,13 @@ def test_an_action_beyond_its_limits_is_clipped_and_stored_as_it_was_sampled() -
     ],
     ids=["discrete", "unknown", "keys", "batch"],
 )
-def test_what_can_not_be_trained_is_one_line(
-    make: Any, num_envs: int, keys: tuple[str, ...], message: str
-) -> None:
+def test_what_can_not_be_trained_is_one_line(make, num_envs, keys, message):
     with pytest.raises(UserError, match=message) as error:
         made(make, num_envs, keys)
     assert "\n" not in str(error.value)
 
 
-def test_a_mask_that_the_environment_does_not_write_is_named() -> None:
+def test_a_mask_that_the_environment_does_not_write_is_named():
     with pytest.raises(UserError, match=r"mask is to be read, .* writes observation"):
         make_env(make_config(*SMOKE, "missingness=from_mask"))
 
@@ -74,7 +71,7 @@ class MaskingEnv(StaircaseEnv):
         return data.set("observation", data["observation"].where(data["mask"], -9e3))
 
 
-def test_an_environment_trains_and_resumes_by_its_target(tmp_path: Path) -> None:
+def test_an_environment_trains_and_resumes_by_its_target(tmp_path):
     make = ["env.make._target_=torchrl.envs.GymEnv", "+env.make.env_name=Pendulum-v1"]
     words = [*SMOKE, "env=torchrl", "env.id=pendulum", *make]
     run(tmp_path / "run", *words, "total_frames=128")
@@ -84,7 +81,7 @@ def test_an_environment_trains_and_resumes_by_its_target(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("eta", [0.0, 0.5])
-def test_the_mask_that_an_environment_writes_says_what_arrived(eta: float) -> None:
+def test_the_mask_that_an_environment_writes_says_what_arrived(eta):
     words = (f"env.make._target_={__name__}.MaskingEnv", "+env.make.batch=4", "env.id=staircase")
     more = ("env=torchrl", "missingness=from_mask", f"missingness.eta={eta}", "noise=none")
     training, config = assembled("experiment=smoke", "collector.num_envs=4", *more, *words)
