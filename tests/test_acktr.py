@@ -1,8 +1,7 @@
 """ACKTR behind the recipe's one path (`algo=acktr`).
 
 A rollout is learned from by natural-gradient steps: the value comes nearer to its targets, the
-divergence of the policy is steered to the one asked for. A stopped run goes on to the last bit. A
-belief that has weights of its own is refused.
+divergence of the policy is steered to the one asked for. A stopped run goes on to the last bit.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from ppo_drbpn import collect, train_rollout
 from recipe_tools import assembled, assert_same_run, read_table, resume, run
 from tensordict import TensorDictBase
 from training.checkpoint import last_checkpoint, load_checkpoint
-from training.errors import UserError
 from training.ppo import add_advantages
 from training.state import Training
 
@@ -110,25 +108,3 @@ def test_the_generator_of_the_whole_process_is_left_alone():
     before = torch.get_rng_state()
     training.algorithm.update(data, 1.0)
     assert torch.equal(before, torch.get_rng_state())
-
-
-@pytest.mark.parametrize("belief", ["drbpn", "gru", "transformer"])
-def test_a_belief_with_weights_of_its_own_is_refused(belief):
-    with pytest.raises(UserError, match=r"`algo=acktr` must have a belief module without weights"):
-        assembled("algo=acktr", f"belief={belief}", "env=inverted_pendulum")
-
-
-@pytest.mark.parametrize(
-    ("override", "line"),
-    [
-        ("algo._target_=nowhere.build", "`algo`: Error loading 'nowhere.build'"),
-        ("+algo.colour=red", "`algo`: .*colour"),
-        ("algo.desired_kl=0", "`algo`: `desired_kl` must be positive"),
-        ("algo.policy.damping=0", "`algo`: `damping` must be positive, got 0"),
-        ("algo.critic.momentum=1", r"`algo`: `momentum` must lie in \[0, 1\)"),
-    ],
-)
-def test_bad_settings_are_refused_in_one_line(override, line):
-    with pytest.raises(UserError, match=line) as error:
-        assembled(*SMOKE, override)
-    assert "\n" not in str(error.value)

@@ -6,7 +6,7 @@ import importlib
 import sys
 
 import pytest
-from evaluation_tools import configured
+from evaluation_tools import ROOT, configured
 from training.config import command
 from training.errors import UserError
 
@@ -39,6 +39,13 @@ COMMANDS = ("evaluate", "diagnose", "export", "play", "plot_sensors", "report", 
         ("diagnose", {"bins": [1, 3, 3]}, "`bins` must be whole numbers that start at 1 and asc"),
         ("diagnose", {"resamples": 1}, "`resamples` must be at least 2"),
         ("diagnose", {"out": __file__}, "`out` must be a folder, .* is a file"),
+        ("export", {"run": None}, "`run` must name a run folder"),
+        ("export", {"run": str(ROOT)}, f"`{ROOT}` must be a run folder with config.yaml"),
+        ("export", {"out": "p.bin"}, "`out` must end in .pt2 for format=aoti, got p.bin"),
+        ("export", {"out": "p.pt2", "format": "onnx"}, "`out` must end in .onnx for format=onnx"),
+        ("export", {"out": "nowhere/p.pt2"}, "`out` must lie in an existing folder"),
+        ("export", {"format": "tflite"}, "`format` must be aoti, export or onnx, got 'tflite'"),
+        ("export", {"robots": 0}, "`robots` must be at least 1, got 0"),
         ("play", {"run": None}, NO_RUN),
         ("play", {"point": "mcar:2"}, "`points` must hold"),
         ("play", {"mode": "best"}, "`modes` must hold"),
@@ -72,7 +79,8 @@ def test_bad_input_is_answered_with_one_line_before_anything_is_done(
 ):
     config = configured(name) | {"run": str(drbpn), "start": 0} | changes
     if "out" not in changes:
-        config["out"] = str(tmp_path / ("film.gif" if name == "play" else "out"))
+        written = {"play": "film.gif", "export": "policy.pt2"}.get(name, "out")
+        config["out"] = str(tmp_path / written)
     if name == "evaluate" and "output" not in changes:
         config |= {"output": str(tmp_path / "out.csv"), "processes": changes.get("processes", 1)}
     with pytest.raises(UserError, match=line) as caught:

@@ -83,12 +83,14 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("word", "line"),
+    ("words", "line"),
     [
+        # what can not be composed
         ("loss.modelcoeff=1", "`loss.modelcoeff` is no setting: did you mean `loss.model_coeff`?"),
         ("missingnes=mar", "`missingnes` is no setting: did you mean `missingness`?"),
         ("belief=drpbn", "`belief=drpbn` is no choice: did you mean `drbpn`?"),
         ("missingness.eta=much", "`missingness.eta` must be a finite number, got 'much'"),
+        ("missingness=mcar missingness.eta=nan", "`missingness.eta` must be a finite number"),
         ("optim.lr=inf", "`optim.lr` must be a finite number, got inf"),
         ("total_frames=1.5", "`total_frames` must be a whole number, got 1.5"),
         ("total_frames=nan", "`total_frames` must be a whole number, got nan"),
@@ -104,44 +106,40 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path):
         ("missingness.always_observed=1.0", "`missingness.always_observed` must be under 1"),
         ("env=gym", "`env.id` must be given"),
         ("env.name=CartPole-v1", "`env.name` is no setting: did you mean"),
-    ],
-)
-def test_what_can_not_be_composed_is_one_line(word, line):
-    with pytest.raises(UserError) as error:
-        make_config(word)
-    assert str(error.value).startswith(line)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["missingness.eta=1.5"], "`missingness`: `eta` must be"),
-        (["missingness=delay", "missingness.delay=-1"], "`missingness`: `delay` must be a whole"),
-        (["missingness=delay", "missingness.delay=1000"], "`missingness.delay` must be shorter"),
-        (["missingness=multi_rate", "missingness.period=0"], "`missingness`: `period` must be"),
-        (["noise=stuck", "noise.stuck_probability=2"], "`noise`: `probability` must be"),
-        (["noise=drift", "noise.drift_std=-1"], "`noise`: `walk_std` must be"),
-        (["missingness.eta=nan", "missingness=mcar"], "`missingness.eta` must be a finite number"),
-        (["belief.state_dim=0"], "`belief`: `state_dim` must be an int of at least 1, got 0"),
-        (["belief.policy_input=guess"], "`belief`: `policy_input` must be 'mean' or 'mean_cov'"),
-        (["belief=gru", "belief.cell=rnn"], "`belief`: `cell` must be 'gru' or 'lstm', got 'rnn'"),
-        (["belief._target_=nowhere.build"], "`belief`: Error loading 'nowhere.build'"),
-        (["+belief.colour=red"], "`belief`: build() got an unexpected keyword argument 'colour'"),
-        (["heads.critic_input=all"], "`heads`: `critic_input` must be features or complete"),
-        (["env.backend=paper"], "`env.backend` must be gymnasium or envpool, got 'paper'"),
-        (["transforms.own=3"], "`transforms.own` must name what is built by `_target_`"),
-        (["env.id=Wlaker2d"], "`env.id=Wlaker2d-v5`: "),
-        (["env=gym", "env.id=CartPole-v1"], "`env.id=CartPole-v1`: "),
-        (["env=gym", "env.id=FrozenLake-v1"], "`env.id=FrozenLake-v1`: "),
-        (["env=gym", "env.id=Pendulum-v1", "missingness=outages", "missingness.group_by=joint"],
+        # what can not be built
+        ("missingness.eta=1.5", "`missingness`: `eta` must be"),
+        ("missingness=delay missingness.delay=-1", "`missingness`: `delay` must be a whole"),
+        ("missingness=delay missingness.delay=1000", "`missingness.delay` must be shorter"),
+        ("missingness=multi_rate missingness.period=0", "`missingness`: `period` must be"),
+        ("missingness=from_mask", "`transforms`: mask is to be read, and the environment"),
+        ("noise=stuck noise.stuck_probability=2", "`noise`: `probability` must be"),
+        ("noise=drift noise.drift_std=-1", "`noise`: `walk_std` must be"),
+        ("belief.state_dim=0", "`belief`: `state_dim` must be an int of at least 1, got 0"),
+        ("belief.policy_input=guess", "`belief`: `policy_input` must be 'mean' or 'mean_cov'"),
+        ("belief=gru belief.cell=rnn", "`belief`: `cell` must be 'gru' or 'lstm', got 'rnn'"),
+        ("belief._target_=nowhere.build", "`belief`: Error loading 'nowhere.build'"),
+        ("+belief.colour=red", "`belief`: build() got an unexpected keyword argument 'colour'"),
+        ("heads.critic_input=all", "`heads`: `critic_input` must be features or complete"),
+        ("collector=ray collector.workers=3", "`collector.workers` must divide `collector.num_"),
+        ("env.backend=paper", "`env.backend` must be gymnasium or envpool, got 'paper'"),
+        ("transforms.own=3", "`transforms.own` must name what is built by `_target_`"),
+        ("env.id=Wlaker2d", "`env.id=Wlaker2d-v5`: "),
+        ("env=gym env.id=CartPole-v1", "`env.id=CartPole-v1`: "),
+        ("env=gym env.id=FrozenLake-v1", "`env.id=FrozenLake-v1`: "),
+        ("env=gym env.id=Pendulum-v1 missingness=outages missingness.group_by=joint",
          "`group_by=joint` goes by the names of the sensors"),
+        *[(f"algo=acktr belief={belief}", "`algo=acktr` must have a belief module without weights")
+          for belief in ("drbpn", "gru", "transformer")],
+        ("algo=acktr belief=none algo._target_=nowhere.build", "`algo`: Error loading 'nowhere.bu"),
+        ("algo=acktr belief=none +algo.colour=red", "`algo`: ACKTR.__init__() got an"),
+        ("algo=acktr belief=none algo.desired_kl=0", "`algo`: `desired_kl` must be positive"),
+        ("algo=acktr belief=none algo.policy.damping=0", "`algo`: `damping` must be positive, got"),
+        ("algo=acktr belief=none algo.critic.momentum=1", "`algo`: `momentum` must lie in [0, 1)"),
     ],
-    ids=" ".join,
 )  # fmt: skip
-def test_what_can_not_be_built_is_one_line(words, line):
+def test_what_can_not_be_composed_or_built_is_one_line(words, line):
     with pytest.raises(UserError) as error:
-        assembled(*words)
+        assembled(*words.split())
     assert str(error.value).startswith(line)
     assert "\n" not in str(error.value)
 

@@ -70,37 +70,24 @@ def test_a_file_decides_as_the_agent_with_nan_or_a_mask(
 
 
 @pytest.mark.parametrize(
-    ("belief", "changes", "line"),
+    ("words", "changes", "line"),
     [
-        ("drbpn", {"run": None}, "`run` must name a run folder"),
-        ("drbpn", {"run": str(DEPLOY)}, "`.*deploy` must be a run folder with config.yaml"),
-        ("drbpn", {"out": "policy.bin"}, "`out` must end in .pt2 for format=aoti, got policy.bin"),
-        ("drbpn", {"out": "p.pt2", "format": "onnx"}, "`out` must end in .onnx for format=onnx"),
-        ("drbpn", {"format": "tflite"}, "`format` must be aoti, export or onnx, got 'tflite'"),
-        ("drbpn", {"out": "nowhere/policy.pt2"}, "`out` must lie in an existing folder"),
-        ("drbpn", {"robots": 0}, "`robots` must be at least 1, got 0"),
         ("gru", {"format": "export"}, "`run` must hold a belief filter .* got belief=gru"),
-        ("none", {"format": "export"}, "`run` must hold a belief filter .* got belief=none"),
-        ("drbpn", {"out": "p.onnx", "robust": "huber"},
-         "`format=onnx`: `sequential` needs .*`robust` None"),
+        ("drbpn belief.emission.cov=full", {}, "`format=onnx`: .* needs a diagonal emission"),
+        ("drbpn", {"robust": "huber"}, "`format=onnx`: `sequential` needs .*`robust` None"),
     ],
-)  # fmt: skip
-def test_what_can_not_be_exported_is_one_line_and_no_file(
-    trained_run, tmp_path, monkeypatch, belief, changes, line
-):
-    run = str(trained_run(belief))
-    monkeypatch.chdir(tmp_path)
+)
+def test_what_has_no_such_form_is_one_line_and_no_file(trained_run, tmp_path, words, changes, line):
+    run = trained_run(*words.split())
+    out = tmp_path / ("p.pt2" if "format" in changes else "p.onnx")
     with pytest.raises(UserError, match=line) as caught:
-        recipe.run(configured("export") | {"run": run, "steps": 4} | changes)
+        exported(run, out, **changes)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_noise_covariance_has_no_onnx_form(trained_run, tmp_path):
-    run = trained_run("drbpn", "belief.emission.cov=full")
-    with pytest.raises(UserError, match="`format=onnx`: `sequential` needs a diagonal emission"):
-        exported(run, tmp_path / "p.onnx")
-    exported(run, tmp_path / "p.pt2", format="export")
+def test_a_full_noise_covariance_has_another_form(trained_run, tmp_path):
+    exported(trained_run("drbpn", "belief.emission.cov=full"), tmp_path / "p.pt2", format="export")
 
 
 def test_a_missing_package_and_a_missing_compiler_are_named(drbpn, tmp_path, monkeypatch):

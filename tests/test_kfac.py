@@ -74,33 +74,28 @@ def test_the_factors_of_a_linear_gaussian_layer_are_its_exact_fisher_matrix(gene
     torch.testing.assert_close(torch.kron(a, g), exact, rtol=1e-12, atol=1e-12)
 
 
-def test_every_layer_of_a_network_has_the_second_moments_of_its_inputs_and_scores(generator):
-    module = network(generator, 3, 4, 2)
-    inputs, score = normal(generator, N, 3), normal(generator, N, 2)
-    optimizer = KFAC(module, **NUMBERS)
-    observe(optimizer, module, inputs, score)
-    # The score of a layer's output is the gradient by its bias, one sample at a time.
-    biases = [module[0].bias, module[2].bias]
-    grads = [torch.autograd.grad(module(x) @ s, biases) for x, s in zip(inputs, score, strict=True)]
-    hidden = torch.tanh(module[0](inputs)).detach()
-    for place, a, g in zip((0, 2), (inputs, hidden), zip(*grads, strict=True), strict=True):
-        state = optimizer.state[module[place].weight]
-        for key, factor in zip("ag", kronecker_factors(a, torch.stack(g)), strict=True):
-            torch.testing.assert_close(state[key] / (1 - NUMBERS["decay"]), factor)
-
-
-def test_the_curvature_is_a_weighted_mean_of_what_was_observed(generator):
-    layer, decay = network(generator, 3, 2)[0], 0.7
-    optimizer = KFAC(layer, **{**NUMBERS, "decay": decay})
-    batches = [(normal(generator, N, 3), normal(generator, N, 2)) for _ in range(3)]
-    for inputs, score in batches:
-        observe(optimizer, layer, inputs, score)
+def test_the_curvature_of_every_layer_is_a_weighted_mean_of_what_was_observed(generator):
+    module, decay = network(generator, 3, 4, 2), 0.7
+    optimizer = KFAC(module, **{**NUMBERS, "decay": decay})
+    seen = []
+    for _ in range(3):
+        inputs, score = normal(generator, N, 3), normal(generator, N, 2)
+        observe(optimizer, module, inputs, score)
+        # The score of a layer's output is the gradient by its bias, one sample at a time.
+        biases = [module[0].bias, module[2].bias]
+        grads = [
+            torch.autograd.grad(module(x) @ s, biases) for x, s in zip(inputs, score, strict=True)
+        ]
+        hidden = torch.tanh(module[0](inputs)).detach()
+        pairs = zip((inputs, hidden), zip(*grads, strict=True), strict=True)
+        seen.append([kronecker_factors(a, torch.stack(g)) for a, g in pairs])
     weights = torch.tensor([decay**2, decay, 1.0], dtype=torch.float64)
-    factors = [kronecker_factors(*batch) for batch in batches]
-    state = optimizer.state[layer.weight]
-    for key, values in zip("ag", zip(*factors, strict=True), strict=True):
-        mean = sum(w * f for w, f in zip(weights / weights.sum(), values, strict=True))
-        torch.testing.assert_close(state[key] / (1 - decay**3), mean)
+    weights = weights / weights.sum()
+    for layer, place in enumerate((0, 2)):
+        state = optimizer.state[module[place].weight]
+        for factor, key in enumerate("ag"):
+            mean = sum(w * each[layer][factor] for w, each in zip(weights, seen, strict=True))
+            torch.testing.assert_close(state[key] / (1 - decay**3), mean)
 
 
 # The direction --------------------------------------------------------------------------------

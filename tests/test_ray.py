@@ -20,11 +20,6 @@ def test_without_ray_the_pip_command_is_named(monkeypatch):
         assembled(*RAY)
 
 
-def test_workers_must_share_the_simulators_evenly():
-    with pytest.raises(UserError, match=r"must divide `collector.num_envs`, got 3 and 4"):
-        assembled(*RAY, "collector.workers=3")
-
-
 @pytest.mark.slow
 def test_an_address_that_does_not_answer_is_one_line():
     with pytest.raises(UserError, match=r"127.0.0.1:1`: no Ray cluster answers there") as caught:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import random
 import resource
 import shlex
 import shutil
@@ -61,52 +62,52 @@ def test_a_file_where_a_folder_should_be_is_named(tmp_path):
         run(tmp_path / "run" / "below", *SMOKE)
 
 
+LAST = "checkpoints/frames_000000000512.pt"
+TABLE = r"metrics.csv` (can't be read|must begin).*damaged"
+CHECKPOINT = r"512.pt` can't be read.* go on from `frames_.*256.pt`"
+
+
 @pytest.mark.parametrize(
-    ("name", "line"),
+    ("name", "content", "line"),
     [
-        ("metrics.csv", "metrics.csv` can't be read as a table: is it damaged"),
-        ("checkpoints", "copy` holds no checkpoint"),
-        ("last checkpoint", "512.pt` must be a checkpoint"),
-        ("config.yaml", "config.yaml"),
+        ("metrics.csv", b"\xff\xfe\x00", TABLE),
+        ("metrics.csv", b"", TABLE),
+        ("metrics.csv", b"fram\n1\n", TABLE),
+        ("metrics.csv", None, "metrics.csv` can't be read as a table: is it damaged"),
+        ("config.yaml", b"\xff\xfe\x00", "config.yaml"),
+        ("config.yaml", b"", "config.yaml"),
+        ("config.yaml", None, "config.yaml"),
+        ("checkpoints", b"no folder", "copy` holds no checkpoint"),
+        (LAST, b"", CHECKPOINT),
+        (LAST, b"PK\x03\x04 cut", CHECKPOINT),
+        (LAST, None, "512.pt` must be a checkpoint"),
     ],
 )
-def test_a_file_for_a_folder_and_a_folder_for_a_file_are_one_line(smoke, tmp_path, name, line):
+def test_what_is_damaged_is_named_and_stays_as_it_is(smoke, tmp_path, name, content, line):
+    """With content None a folder is where a file should be."""
     folder = copied(smoke, tmp_path)
-    path = last_checkpoint(folder) if name == "last checkpoint" else folder / name
-    if path.is_dir():
-        shutil.rmtree(path)
-        path.write_text("no folder")
-    else:
-        path.unlink()
-        path.mkdir()
-    before = contents(folder / "checkpoints")
+    path = folder / name
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    path.mkdir() if content is None else path.write_bytes(content)
+    before = contents(folder)
     with pytest.raises(UserError, match=line) as error:
         resume(folder, "total_frames=640")
     assert "\n" not in str(error.value)
-    assert contents(folder / "checkpoints") == before
+    assert contents(folder) == before
 
 
-@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"", b"fram\n1\n"], ids=repr)
-def test_a_damaged_table_is_named_and_stays_as_it_is(smoke, tmp_path, content):
-    folder = copied(smoke, tmp_path)
-    (folder / "metrics.csv").write_bytes(content)
-    with pytest.raises(UserError, match=r"metrics.csv` (can't be read|must begin).*damaged"):
-        resume(folder, "total_frames=640")
-    assert (folder / "metrics.csv").read_bytes() == content
-
-
-@pytest.mark.parametrize("place", [10, 0.3, 0.6, -40], ids=["head", "third", "middle", "end"])
-def test_a_flipped_bit_in_a_checkpoint_is_refused_and_the_one_before_is_named(
-    smoke, tmp_path, place
-):
-    folder = copied(smoke, tmp_path)
-    path = last_checkpoint(folder)
-    data = bytearray(path.read_bytes())
-    data[int(place * len(data)) if isinstance(place, float) else place] ^= 4
-    path.write_bytes(data)
-    with pytest.raises(UserError, match=r"512.pt` can't be read.* go on from `frames_.*256.pt`"):
-        resume(folder, "total_frames=640")
-    assert path.read_bytes() == data
+def test_a_flipped_bit_in_a_checkpoint_is_refused_and_the_one_before_is_named(smoke, tmp_path):
+    path = last_checkpoint(copied(smoke, tmp_path))
+    whole, draw = path.read_bytes(), random.Random(0)
+    for place in (82, *(draw.randrange(8 * len(whole)) for _ in range(100))):
+        data = bytearray(whole)
+        data[place // 8] ^= 1 << place % 8
+        path.write_bytes(data)
+        with pytest.raises(
+            UserError, match=r"512.pt` can't be read.* go on from `frames_.*256.pt`"
+        ):
+            load_checkpoint(path)
+        assert path.read_bytes() == data
 
 
 def test_a_bit_that_the_archive_does_not_watch_is_seen_by_the_sum_beside_it(smoke, tmp_path):
@@ -144,6 +145,8 @@ def test_what_a_killed_writer_left_is_removed_and_foreign_files_are_left_alone(s
     foreign = folder / "checkpoints" / "frames_zzz.pt"
     for path in (*(folder / name for name in stale), foreign):
         path.write_text("half")
+    with (folder / "metrics.csv").open("a") as table:
+        table.write("9999,1.")
     assert resume(folder) == 0
     assert_same_run(smoke, folder)
     assert not list(folder.rglob(".*.tmp*"))

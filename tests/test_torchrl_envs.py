@@ -9,11 +9,11 @@ import pytest
 import torch
 from contract_environments import ACTION, OBS, StaircaseEnv
 from ppo_drbpn import train_rollout
-from recipe_tools import SMOKE, assembled, make_config, read_table, resume, run
+from recipe_tools import SMOKE, assembled, read_table, resume, run
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded
 from torchrl.envs import GymEnv, TransformedEnv
-from training.envs import make_env, make_torchrl_env
+from training.envs import make_torchrl_env
 from training.errors import UserError
 
 
@@ -48,11 +48,6 @@ def test_what_can_not_be_trained_is_one_line(make, num_envs, keys, message):
     with pytest.raises(UserError, match=message) as error:
         made(make, num_envs, keys)
     assert "\n" not in str(error.value)
-
-
-def test_a_mask_that_the_environment_does_not_write_is_named():
-    with pytest.raises(UserError, match=r"mask is to be read, .* writes observation"):
-        make_env(make_config(*SMOKE, "missingness=from_mask"))
 
 
 class MaskingEnv(StaircaseEnv):

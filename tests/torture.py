@@ -1,15 +1,13 @@
-"""What a run survives: kills, a full disk, flipped bits, planted files. Longer than the suite.
+"""What a run survives: kills at random moments, a full disk. Longer than the suite.
 
 ``python tests/torture.py`` (about 20 minutes on a quiet machine) or ``--quick`` (about one).
 Prints one line a class with its counts, in between what has been tried (on stderr), and leaves with
 status 1 where a count is not as it must be. Classes named go alone, in any order and at any time:
-``python tests/torture.py sweep planted`` draws the moments that the whole run draws for these two.
+``python tests/torture.py sweep`` draws the moments that the whole run draws for it.
 
-kills         50 runs of every belief and algorithm, killed at random moments and resumed
-sweep         8 kills of a sweep and its cells
-full_disk     20 runs of which no file may grow beyond a random size
-flipped_bits  800 flipped bits of a checkpoint
-planted       14 kinds of foreign or damaged files in a run folder
+kills      50 runs of every belief and algorithm, killed at random moments and resumed
+sweep      8 kills of a sweep and its cells
+full_disk  20 runs of which no file may grow beyond a random size
 
 Every run is a process of its own that is killed by SIGKILL at a random moment, resumed, killed
 again, and let go on to its end. It then equals the run that nobody stopped, to the last bit: its
@@ -37,7 +35,6 @@ from recipe_tools import ROOT, differences, make_config, read_table, resume, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
 from training.console import say
-from training.errors import UserError
 
 TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 SMALL = ("experiment=smoke", "total_frames=768", "checkpoint.every_frames=128",
@@ -235,110 +232,10 @@ def full_disk(work: Path, draw: random.Random, count: int) -> list[str]:
     return wrong
 
 
-def flipped_bits(work: Path, draw: random.Random, count: int) -> list[str]:
-    """Flip a bit of a checkpoint, with its sum beside it and without."""
-    folder = work / "bits"
-    finished(folder, CASES["drbpn"])
-    path = last_checkpoint(folder)
-    sums, whole = path.with_name(path.name + ".sha256"), path.read_bytes()
-    kept, wrong = sums.read_text(), []
-    loaded = Counter[bool]()
-    for with_sum in (True, False):
-        sums.write_text(kept) if with_sum else sums.unlink()
-        for _ in range(count):
-            place = draw.randrange(8 * len(whole))
-            damaged = bytearray(whole)
-            damaged[place // 8] ^= 1 << place % 8
-            path.write_bytes(damaged)
-            try:
-                load_checkpoint(path)
-            except UserError as error:
-                if "\n" in str(error) or "go on from `frames_" not in str(error):
-                    wrong.append(f"bit {place}: {error}")
-            else:
-                loaded[with_sum] += 1
-                if with_sum:
-                    wrong.append(f"bit {place} was loaded")
-    say(
-        f"flipped bits: {count - loaded[True]} of {count} refused, with the sum beside it; "
-        f"by the archive's own sums {count - loaded[False]} of {count}"
-    )
-    return wrong
-
-
-def planted(work: Path, draw: random.Random, count: int) -> list[str]:
-    """Put files into a run folder that do not belong there, and go on with the run."""
-    del draw
-    straight, seed = work / "plant-straight", work / "plant-seed"
-    finished(straight, CASES["none"])
-    shutil.copytree(straight, seed)
-    last_checkpoint(seed).unlink()
-
-    def file_for_folder(folder: Path) -> None:
-        shutil.rmtree(folder / "checkpoints")
-        (folder / "checkpoints").write_text("no folder")
-
-    def cut(name: str, size: int) -> Callable[[Path], None]:
-        return lambda folder: os.truncate(folder / name, size)
-
-    def writes(name: str, data: bytes) -> Callable[[Path], object]:
-        return lambda folder: (folder / name).write_bytes(data)
-
-    def folder_for(name: str) -> Callable[[Path], None]:
-        return lambda folder: ((folder / name).unlink(), (folder / name).mkdir())[1]
-
-    latest = last_checkpoint(seed).relative_to(seed)
-    harmless: dict[str, Callable[[Path], object]] = {
-        "frames_zzz.pt": writes("checkpoints/frames_zzz.pt", b"\x00\x01"),
-        "a stale temporary": writes("checkpoints/.frames_000000000512.pt.tmp", b"half"),
-        "a stale table": writes(".metrics.csv.1.tmp", b"half"),
-        "half a row": lambda folder: (folder / "metrics.csv").open("a").write("9999,1."),
-        "a lost evaluation": lambda folder: (folder / "evaluation.csv").unlink(),
-    }
-    harmful: dict[str, Callable[[Path], object]] = {
-        "binary metrics.csv": writes("metrics.csv", bytes(range(256))),
-        "cut header": cut("metrics.csv", 4),
-        "cut checkpoint": cut(str(latest), 5000),
-        "empty checkpoint": cut(str(latest), 0),
-        "binary config.yaml": writes("config.yaml", bytes(range(256))),
-        "empty config.yaml": cut("config.yaml", 0),
-        "a file for the folder of checkpoints": file_for_folder,
-        "a folder for metrics.csv": folder_for("metrics.csv"),
-        "a folder for a checkpoint": folder_for(str(latest)),
-    }
-    wrong, refused, ignored = [], 0, 0
-    for number, (name, plant) in enumerate([*harmless.items(), *harmful.items()][:count]):
-        folder = shutil.copytree(seed, work / f"plant-{number}")
-        plant(folder)
-        before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.suffix == ".pt"}
-        process = Process(lambda folder=folder: resume(folder), work / "log")
-        status = process.ends()
-        if name in harmless:
-            different = unequal(straight, folder) if status == 0 else [process.log.read_text()]
-            left = [] if name == "frames_zzz.pt" else [str(p) for p in folder.rglob(".*.tmp*")]
-            # A table that is gone lacks what the checkpoint believes is in it.
-            wanted = ["evaluation.csv"] if name == "a lost evaluation" else []
-            ignored += different + left == wanted
-            wrong += [f"{name}: {line}" for line in different + left if line not in wanted]
-        else:
-            kept = all(p.is_file() and p.read_bytes() == data for p, data in before.items())
-            good = status == 2 and process.is_one_line() and kept
-            refused += good
-            wrong += [] if good else [f"{name}: status {status}\n{process.log.read_text()[-800:]}"]
-        progress(f"planted: {name}, {len(wrong)} wrong so far")
-    say(
-        f"planted files: {refused} of {len(harmful)} refused in one line, "
-        f"{ignored} of {len(harmless)} without effect"
-    )
-    return wrong
-
-
 CLASSES = {
     "kills": (kills, 6, 50),
     "sweep": (sweep, 1, 8),
     "full_disk": (full_disk, 2, 20),
-    "flipped_bits": (flipped_bits, 100, 400),
-    "planted": (planted, 99, 99),
 }
 
 
