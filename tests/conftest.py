@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,12 @@ def smoke(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "smoke"
     assert run(folder, *SMOKE) == 0
     return folder
+
+
+@pytest.fixture
+def folder(smoke, tmp_path):
+    """A copy of the run of the smoke experiment, to go on with or to spoil."""
+    return shutil.copytree(smoke, tmp_path / "copy")
 
 
 @pytest.fixture(autouse=True)

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import csv
 import functools
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from contract_environments import saved
 from omegaconf import DictConfig
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.config import composed_config
+from training.errors import UserError
 from training.run_folder import resumed_config
 
 __all__ = [
     "BELIEFS", "CONF", "ROOT", "SMOKE", "TIMES", "assembled", "assert_same_run", "command",
-    "differences", "make_config", "make_folder", "read_table", "resume", "run", "saved",
+    "differences", "make_config", "make_folder", "read_table", "refused", "resume", "run", "saved",
 ]  # fmt: skip
 
 ROOT = Path(__file__).parents[1]
@@ -41,6 +44,14 @@ def _composed(*overrides: str) -> DictConfig:
 def make_config(*overrides: str) -> DictConfig:
     """Compose and check the configuration that a command line gives."""
     return copy.deepcopy(_composed(*overrides))
+
+
+@contextlib.contextmanager
+def refused(line: str) -> Iterator[pytest.ExceptionInfo[UserError]]:
+    """What is done inside is refused by one line in which ``line`` is found."""
+    with pytest.raises(UserError, match=line) as caught:
+        yield caught
+    assert "\n" not in str(caught.value)
 
 
 def run(folder: Path, *overrides: str) -> int:

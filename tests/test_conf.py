@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 from evaluation.points import missingness_kind, missingness_name
 from omegaconf import OmegaConf
-from recipe_tools import CONF, assembled, command, make_config
+from recipe_tools import CONF, assembled, command, make_config, refused
 from training.config import choice
 from training.envs import env_name
 from training.errors import UserError
@@ -150,7 +150,7 @@ def test_missingness_has_one_name_that_reads_back():
     assert names == ["none:0", "mcar:0.5", "mar:0.5", "nmar:0.5", "outages:0.5:20:sensor",
                      "delay:2", "multi_rate:4:sensor"]  # fmt: skip
     assert missingness_name(choice("missingness", "mcar", eta=0.2)) == "mcar:0.2"
-    with pytest.raises(UserError, match="`missingness=mcar` has no `mean_length`"):
+    with refused("`missingness=mcar` has no `mean_length`"):
         choice("missingness", "mcar", mean_length=3)
 
 
@@ -185,5 +185,5 @@ def test_resume_takes_the_settings_of_its_folder_and_only_the_allowed_overrides(
 )
 def test_resume_refuses_other_overrides(tmp_path, word, line):
     write_config(tmp_path, make_config())
-    with pytest.raises(UserError, match=line):
+    with refused(line):
         resumed_config(make_config(), ["resume=x", word], tmp_path)

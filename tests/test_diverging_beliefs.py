@@ -13,8 +13,8 @@ from analysis.calibration import diagnose
 from evaluation.table import Protocol, evaluate_condition
 from evaluation.trained import load_trained_agent
 from evaluation_tools import evaluate, parse, read_rows
+from recipe_tools import refused
 from training.config import explained
-from training.errors import UserError
 
 from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
 
@@ -126,7 +126,7 @@ def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
     assert run_diagnosis(drbpn, tmp_path, points=["mcar:0.8", "mcar:0.4"]) == 0
     assert "drbpn, mcar:0.8: no rows, the belief is no longer finite" in capsys.readouterr().out
     assert {row["point"] for row in read_rows(tmp_path / "precision.csv")} == {"mcar:0.4"}
-    with pytest.raises(UserError, match="no point is left: every belief diverged"):
+    with refused("no point is left: every belief diverged"):
         run_diagnosis(drbpn, tmp_path, points=["mcar:0.8"])
 
 

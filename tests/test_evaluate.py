@@ -17,16 +17,15 @@ import evaluate as recipe
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from analysis.figures import draw_evaluation
 from evaluation import episodes as episodes_room
 from evaluation import table as table_room
-from evaluation.episodes import StoppingPolicy, over_episodes
+from evaluation.episodes import over_episodes
 from evaluation.folders import find_folders, override
 from evaluation.table import evaluate_tasks
 from evaluation.trained import load_trained_agent
 from evaluation_tools import configured, evaluate, read_rows
-from training.errors import UserError
+from recipe_tools import refused
 from training.run_folder import read_config, write_config
 
 
@@ -53,23 +52,18 @@ def test_more_episodes_only_add(trained_run, tmp_path, monkeypatch):
     assert len(set(returns)) > len(returns) / 2  # no episode is another one again
 
 
-def test_the_global_generator_is_left_alone_and_stopping_gives_nothing(agent):
-    before = torch.get_rng_state()
-    how = {"episodes": 2, "mode": "mean", "seed": 5}
-    policy = StoppingPolicy(agent.agent)
-    result = episodes_room.evaluate(policy, agent.environments(), **how)
-    assert result is not None
-    assert len(result) == 2
-    assert episodes_room.evaluate(policy, agent.environments(), **how, stop=lambda: True) is None
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_a_small_share_of_one_entry_weighs_as_what_it_is():
     """In two episodes one entry of 100 arrived in all: its likelihood is that of the evaluation."""
     few = pd.DataFrame({"return": 0.0, "length": 10, "missing_ratio": [0.99, 1, 1, 0]})
-    few = few.assign(log_likelihood=[-2.5, 0, 0, np.nan], point=["few", "few", "none", "diverged"])
+    few = few.assign(log_likelihood=[-2.5, 0, 0, np.nan], point=["few", "few", "none", "nan"])
     found = over_episodes(few, ["point"]).log_likelihood
     np.testing.assert_allclose(found, [-2.5, 0.0, np.nan])
+    two = pd.DataFrame({"return": [1.0, 2.0], "length": [10, 30], "missing_ratio": [0.2, 0.6]})
+    two = two.assign(log_likelihood=[1.0, 2.0], diverged=[0, 1], point="two")
+    found = over_episodes(two, ["point"]).iloc[0]
+    assert found.missing_ratio == pytest.approx((0.2 * 10 + 0.6 * 30) / 40)
+    assert found.log_likelihood == pytest.approx((1.0 * 8 + 2.0 * 12) / 20)
+    assert (found.return_mean, found.diverged, found.episodes) == (1.5, 0.5, 2)
 
 
 # The table ------------------------------------------------------------------------------------
@@ -143,7 +137,7 @@ def test_a_table_of_other_settings_is_not_mixed_with(drbpn, tmp_path):
         ({"reduction_seed": 3}, "with reduction_seed 0, and 3"),
         ({"robust": "imq"}, "with method drbpn, and drbpn, imq 4"),
     ):
-        with pytest.raises(UserError, match=f"{what} is asked for"):
+        with refused(f"{what} is asked for"):
             evaluate(out, drbpn, points=points, **change)
         assert out.read_bytes() == before
     rows = evaluate(out, drbpn, points="none:0", overwrite=True, episodes=1)
@@ -158,15 +152,15 @@ def test_another_study_of_the_same_folder_names_is_not_taken_for_it(drbpn, feedf
     evaluate(out, first, points="none:0")
     before = out.read_bytes()
     shutil.copytree(feedforward, second)
-    with pytest.raises(UserError, match="holds hopper-s0 at none:0 with belief drbpn, and none is"):
+    with refused("holds hopper-s0 at none:0 with belief drbpn, and none is"):
         evaluate(out, second, points="none:0")
     shutil.rmtree(second)
     shutil.copytree(drbpn, second)
     write_config(second, read_config(second) | {"method": "ppo_ours"})
-    with pytest.raises(UserError, match="with method drbpn, and ppo_ours is asked for"):
+    with refused("with method drbpn, and ppo_ours is asked for"):
         evaluate(out, second, points="none:0")
     assert out.read_bytes() == before
-    with pytest.raises(UserError, match="different names, hopper-s0 comes twice"):
+    with refused("different names, hopper-s0 comes twice"):
         evaluate(out, first, second, points="none:0")
 
 
@@ -174,7 +168,7 @@ def test_another_study_of_the_same_folder_names_is_not_taken_for_it(drbpn, feedf
 def test_a_foreign_table_is_not_overwritten(drbpn, tmp_path, text):
     out = tmp_path / "out.csv"
     out.write_text(text)
-    with pytest.raises(UserError, match=r"no table of this command|can't be read as a table"):
+    with refused(r"no table of this command|can't be read as a table"):
         evaluate(out, drbpn, points="none:0")
     assert out.read_text() == text
 
@@ -203,7 +197,7 @@ def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(drbpn, feedfor
     assert find_folders(str(tmp_path / "*")) == both
     assert find_folders([str(both[0]), str(tmp_path / "*")]) == both
     for wanted in (str(tmp_path / "x*"), str(tmp_path / "x"), [], None):
-        with pytest.raises(UserError, match="`run` must name run folders"):
+        with refused("`run` must name run folders"):
             find_folders(wanted)
 
 
@@ -214,7 +208,7 @@ def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(drbpn, tmp_pat
     rows = evaluate(tmp_path / "out.csv", drbpn, young, points="none:0")
     assert {row["run"] for row in rows} == {"drbpn"}
     assert "young: left out, it has no checkpoint yet" in capsys.readouterr().out
-    with pytest.raises(UserError, match="young` holds no checkpoint"):
+    with refused("young` holds no checkpoint"):
         evaluate(tmp_path / "out.csv", young, points="none:0")
 
 
@@ -246,9 +240,9 @@ def test_a_robust_update_changes_what_spikes_do_and_its_table_has_a_name_of_its_
     assert {row["method"] for row in believed} == {"drbpn"}
     assert {row["method"] for row in weighted} == {"drbpn, huber 4"}
     assert [r["log_likelihood"] for r in believed] != [r["log_likelihood"] for r in weighted]
-    with pytest.raises(UserError, match="`robust` must be null for belief=none, got 'imq'"):
+    with refused("`robust` must be null for belief=none, got 'imq'"):
         evaluate(tmp_path / "none.csv", feedforward, points="none:0", robust="imq")
-    with pytest.raises(UserError, match=r"`output` must not be called points\.csv with robust="):
+    with refused(r"`output` must not be called points\.csv with robust="):
         recipe.run(base | {"output": str(folder / "points.csv")})
 
 

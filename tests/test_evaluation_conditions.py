@@ -14,7 +14,7 @@ from evaluation.conditions import default_conditions, removed_sensors
 from evaluation.sensor_choice import kept_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent
 from evaluation_tools import configured, evaluate, parse
-from training.errors import UserError
+from recipe_tools import refused
 
 from torchrl_drbpn.functional import draw_mechanism
 
@@ -78,7 +78,7 @@ def test_a_condition_leaves_what_it_does_not_name_as_in_training(settings):
      "multi_rate:0", "multi_rate:2:sensor:2", "stuck:2", "stuck:0.1:0.5", "drift:-1", "drift:nan"],
 )  # fmt: skip
 def test_a_condition_that_can_not_be_read_is_refused(text, settings):
-    with pytest.raises(UserError, match="`points` must hold ") as error:
+    with refused("`points` must hold ") as error:
         parse(text, settings)
     assert repr(text) in str(error.value)
 
@@ -112,7 +112,7 @@ def test_mean_lengths_that_no_chain_has_are_left_out_and_refused(settings):
     }  # fmt: skip
     texts = default_conditions(levels, full=True, model=False)
     assert texts == ["outages:0.8:4:sensor", "outages:0.8:20:sensor"]
-    with pytest.raises(UserError, match="`mean_length` must be at least eta"):
+    with refused("`mean_length` must be at least eta"):
         parse("outages:0.8:2", settings)
 
 
@@ -165,7 +165,7 @@ def test_random_reduction_is_the_same_for_every_agent_and_nested(agent, feedforw
         assert (removed | ~smaller).all()
         smaller = removed
     by_model = parse("reduction:0.5:model", other.settings)
-    with pytest.raises(UserError, match="has learned no H, P and R"):
+    with refused("has learned no H, P and R"):
         removed_sensors(by_model, other, episodes=1, reduction_seed=0)
 
 

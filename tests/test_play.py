@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +24,11 @@ from gymnasium.envs.classic_control import PendulumEnv
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from PIL import Image
+from recipe_tools import refused
 from rendering import trajectory
 from rendering.belief_figure import ABSENT, BELIEF, MISSING, chosen_sensors
 from rendering.trajectory import Camera, Recording, record_episode
 from rendering.video import Film, write_video
-from training.errors import UserError
 
 # Small, and without the robot: rendering needs what a machine may lack.
 SMALL = {"start": 0, "steps": 6, "sensors": 2, "window": 4, "size": 240, "robot": False, "seed": 4}
@@ -91,6 +90,8 @@ def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(drbpn
     )
     assert (record(drbpn, "none:0").observed).all()
     assert np.isnan(record(drbpn, "none:0").coverage)
+    removed = ~record(drbpn, "reduction:0.5:random").observed.any(0)
+    assert removed.sum() == 2
 
 
 def test_coverage_counts_the_missing_entries_inside_their_interval(recording):
@@ -122,12 +123,6 @@ def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(drbpn, t
     said = capsys.readouterr().out
     assert said.startswith("steps 0 to 4, missing 0.")
     assert "3 frames of 320 x 200; written" in said
-
-
-def test_without_a_name_the_film_lies_in_the_run_folder(drbpn, tmp_path):
-    folder = shutil.copytree(drbpn, tmp_path / "run")
-    assert show(folder, None, steps=2) == 0
-    assert (folder / "play.gif").is_file()
 
 
 def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path):
@@ -242,19 +237,6 @@ def test_a_task_that_is_not_mujocos_is_drawn_where_its_state_can_be_set(monkeypa
 # Points and beliefs ---------------------------------------------------------------------------
 
 
-def test_a_point_may_take_sensors_away_for_good(drbpn, tmp_path):
-    assert show(drbpn, tmp_path / "film.gif", point="reduction:0.5:random", steps=3) == 0
-    with Image.open(tmp_path / "film.gif") as video:
-        video.seek(2)
-        frame = np.asarray(video.convert("RGB"))
-    film = make_film(record(drbpn, steps=3), width=240)
-    absent = []
-    for each in range(4):
-        row, columns = pixels_of(film, 0, (each + 0.5) / 4)
-        absent.append(near(frame[row, columns[1:]], ABSENT, 40))
-    assert sorted(np.stack(absent).all(1).tolist()) == [False, False, True, True]
-
-
 @pytest.mark.parametrize(
     ("belief", "kind", "has_interval"),
     [("none", "nothing", False), ("fill", "estimate", False), ("gru", "forecast", True)],
@@ -276,7 +258,7 @@ def test_another_belief_shows_what_it_says_and_no_more(
 
 def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(drbpn):
     length = len(record(drbpn, steps=100_000).steps)
-    with pytest.raises(UserError, match=f"`start` must lie .* after {length} steps"):
+    with refused(f"`start` must lie .* after {length} steps"):
         show(drbpn, drbpn / "film.gif", point="mcar:0.5", start=length + 2, window=10)
 
 
@@ -284,7 +266,7 @@ def test_an_mp4_without_its_package_is_refused_before_anything_is_done(
     drbpn, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None)
-    with pytest.raises(UserError, match=r"needs imageio-ffmpeg: .* film.gif"):
+    with refused(r"needs imageio-ffmpeg: .* film.gif"):
         show(drbpn, tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())
 

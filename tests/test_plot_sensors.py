@@ -24,8 +24,8 @@ from evaluation.sensor_choice import SensorModel, kept_sensors, learned_sensors
 from evaluation.trained import load_trained_agent
 from matplotlib.image import imread
 from omegaconf import OmegaConf
+from recipe_tools import refused
 from tensordict import TensorDict
-from training.errors import UserError
 
 from torchrl_drbpn import BeliefFilterModule, GaussianTransition, LinearGaussianEmission, functional
 
@@ -114,7 +114,7 @@ def test_the_kept_sensors_are_the_first_of_the_ranking(agents, models):
 def test_a_covariance_that_depends_on_the_state_ranks_no_sensors(runs):
     trained = load_trained_agent(runs[0])
     trained.agent.belief.filter.transition = GaussianTransition(OBS, ACTION, cov_network=True)
-    with pytest.raises(UserError, match="`belief=drbpn` predicts another covariance at every"):
+    with refused("`belief=drbpn` predicts another covariance at every"):
         learned_sensors(trained)
 
 
@@ -188,7 +188,7 @@ def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(runs, tmp
     assert "young: left out, it has no checkpoint yet" in said
     assert "1 run, written" in said
     twin = shutil.copytree(runs[3], tmp_path / "twin")
-    with pytest.raises(UserError, match="`run` must name runs that have learned H, P and R"):
+    with refused("`run` must name runs that have learned H, P and R"):
         draw([str(runs[3]), str(twin)], tmp_path / "none")
     assert not (tmp_path / "none").exists()
 

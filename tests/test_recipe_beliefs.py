@@ -15,10 +15,9 @@ from beliefs import Belief
 from contracts import ACTION, OBS, RecipeBeliefContract
 from omegaconf import DictConfig
 from ppo_drbpn import train_rollout
-from recipe_tools import BELIEFS, assembled, differences, make_config, saved
+from recipe_tools import BELIEFS, assembled, differences, make_config, refused, saved
 from torchrl.modules import set_recurrent_mode
 from training.config import build
-from training.errors import UserError
 from training.run_folder import metric_columns
 
 # Choices inside a belief that change what it reads, writes or remembers.
@@ -55,7 +54,7 @@ def test_the_beliefs_on_disk_are_found():
 def test_its_entry_holds_the_keys_that_its_target_takes(belief):
     entry = settings_of(belief)
     assert entry["name"] == belief
-    with pytest.raises(UserError, match=r"`belief`: .*colour"):
+    with refused(r"`belief`: .*colour"):
         build("belief", {**entry, "colour": "red"}, obs_dim=3, action_dim=1)
 
 

@@ -10,19 +10,16 @@ import re
 import pytest
 import torch
 from ppo_drbpn import train_rollout
-from recipe_tools import SMOKE, assembled, read_table, resume, run
+from recipe_tools import SMOKE, assembled, read_table, refused, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint
-from training.errors import DivergedError, UserError
+from training.errors import DivergedError
 
 
 @pytest.mark.parametrize("belief", ["drbpn", "gru", "none"])
 def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(tmp_path, belief):
     folder = tmp_path / "run"
-    with pytest.raises(
-        UserError, match=r"training stopped at 0 steps: .*(nan|inf|no longer finite)"
-    ) as error:
+    with refused(r"training stopped at 0 steps: .*(nan|inf|no longer finite)") as error:
         run(folder, *SMOKE, f"belief={belief}", "optim.lr=1e30")
-    assert "\n" not in str(error.value)
     assert "checkpoint" not in str(error.value)
     assert not list(folder.rglob("*.pt"))
     assert not read_table(folder / "evaluation.csv")
@@ -42,7 +39,7 @@ def test_a_run_that_diverges_later_names_its_last_good_checkpoint(tmp_path, monk
     monkeypatch.setattr(ppo_drbpn, "collect", spoilt)
     folder = tmp_path / "run"
     kept = rf"at 256 steps: .* Its last checkpoint, at 256 steps, is in {re.escape(str(folder))}"
-    with pytest.raises(UserError, match=kept):
+    with refused(kept):
         run(folder, *SMOKE, "checkpoint.every_frames=128")
     assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
     assert "final" not in (folder / "evaluation.csv").read_text()
@@ -81,7 +78,7 @@ def test_a_fault_of_the_environment_ends_in_one_line_and_a_saved_run(
 
     monkeypatch.setattr(ppo_drbpn, "collect", faulty)
     folder = tmp_path / "run"
-    with pytest.raises(UserError, match=line):
+    with refused(line):
         run(folder, *SMOKE, "checkpoint.every_frames=10000")
     assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
     monkeypatch.undo()

@@ -10,7 +10,7 @@ import save_agent
 import torch
 from evaluation.trained import WEIGHTS, load_trained_agent
 from evaluation_tools import ROOT, configured, evaluate
-from training.errors import UserError
+from recipe_tools import refused
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +38,7 @@ def test_a_saved_agent_acts_as_the_run_did(finished, tmp_path):
     assert tables[0] == [row | {"run": finished.name} for row in tables[1]]
     film = configured("play") | {"run": str(out), "robot": False, "start": 0, "steps": 2}
     assert play.run(film) == 0
+    assert (out / "play.gif").is_file()
     card = (out / "README.md").read_text()
     for text in ("# InvertedPendulum-v5, drbpn", "mcar:0.4", "| 128 |", "| seed | 0 |", "sampled"):
         assert text in card
@@ -58,11 +59,10 @@ def test_an_agent_of_the_repository_acts_under_this_code(folder, tmp_path):
 def test_a_run_folder_is_not_written_into_and_broken_weights_are_one_line(
     finished, drbpn, tmp_path
 ):
-    with pytest.raises(UserError, match="`out` must be a folder for an agent"):
+    with refused("`out` must be a folder for an agent"):
         save(finished, drbpn)
     save(finished, tmp_path / "agent")
     weights = tmp_path / "agent" / WEIGHTS
     weights.write_bytes(weights.read_bytes()[:-40])
-    with pytest.raises(UserError, match="can't be read as weights") as caught:
+    with refused("can't be read as weights"):
         load_trained_agent(tmp_path / "agent")
-    assert "\n" not in str(caught.value)

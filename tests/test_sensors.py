@@ -5,9 +5,8 @@ from __future__ import annotations
 import gymnasium
 import pytest
 from omegaconf import OmegaConf
-from recipe_tools import CONF
+from recipe_tools import CONF, refused
 from training.config import choice
-from training.errors import UserError
 from training.sensors import named_sensors, sensor_groups, sensor_names
 
 TASKS = sorted(
@@ -42,7 +41,7 @@ def test_angles_and_velocities_are_where_the_simulator_has_them():
 
 def test_an_unknown_task_has_numbers_for_names_and_a_known_one_of_another_size_is_refused():
     assert sensor_names("Pusher", "v5", 2) == ["component 0", "component 1"]
-    with pytest.raises(UserError, match=r"`Hopper-v5` has 11 named components.* has 12"):
+    with refused(r"`Hopper-v5` has 11 named components.* has 12"):
         sensor_names("Hopper", "v5", 12)
 
 
@@ -65,7 +64,7 @@ def test_a_joint_is_its_angle_and_its_velocity_and_a_kind_all_positions():
 
 
 def test_groups_need_names():
-    with pytest.raises(UserError, match="goes by the names of the sensors"):
+    with refused("goes by the names of the sensors"):
         sensor_groups(["component 0", "component 1"], "joint")
-    with pytest.raises(UserError, match="`group_by` must be sensor, joint or kind"):
+    with refused("`group_by` must be sensor, joint or kind"):
         sensor_groups(["pole angle"], "leg")

@@ -28,11 +28,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.cell_sweeper import CellSweeper, continued, run_cell
 from omegaconf import DictConfig, OmegaConf
 from ppo_drbpn import train
-from recipe_tools import CONF, ROOT, command, differences, make_config, read_table, run
+from recipe_tools import CONF, ROOT, command, differences, make_config, read_table, refused, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.console import STOP_FILE, StopRequest
-from training.errors import UserError
 
 STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
@@ -163,7 +162,7 @@ def test_a_cell_that_was_killed_before_its_first_checkpoint_starts_anew(done, tm
 
 
 def test_another_configuration_in_the_folder_of_a_cell_is_refused(done):
-    with pytest.raises(UserError, match=r"other settings \(seed, optim.lr\): name another folder"):
+    with refused(r"other settings \(seed, optim.lr\): name another folder"):
         continued(make_config(*BRIEF, "seed=1", "optim.lr=0.1"), done)
 
 
