@@ -39,6 +39,12 @@ def folder(smoke, tmp_path):
     return shutil.copytree(smoke, tmp_path / "copy")
 
 
+@pytest.fixture
+def own_directory(tmp_path, monkeypatch):
+    """MuJoCo writes the warnings of a model file into the current directory."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture(autouse=True)
 def _global_state():
     """Recipes set both; no test may depend on which one ran before."""

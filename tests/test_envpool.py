@@ -21,16 +21,13 @@ from torchrl.envs import check_env_specs
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
 # Version 4 is tested on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date")
+pytestmark = [
+    pytest.mark.usefixtures("own_directory"),
+    pytest.mark.filterwarnings("ignore:.*is out of date"),
+]
 
 FREE_JOINT = [task for task in TASKS if task.startswith(("Ant", "Humanoid"))]
 OTHERS = [task for task in TASKS if task not in FREE_JOINT]
-
-
-@pytest.fixture(autouse=True)
-def _own_directory(tmp_path, monkeypatch):
-    # MuJoCo writes the warnings of a model file into the current directory.
-    monkeypatch.chdir(tmp_path)
 
 
 def positions_and_velocities(env_id, observation, nq, nv):

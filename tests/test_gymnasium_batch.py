@@ -20,16 +20,13 @@ from torchrl.envs import check_env_specs
 from torchrl_drbpn import EnvPoolBatchEnv, GymnasiumBatchEnv, SimulatorError
 
 # Version 4 is tested on purpose.
-pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date")
+pytestmark = [
+    pytest.mark.usefixtures("own_directory"),
+    pytest.mark.filterwarnings("ignore:.*is out of date"),
+]
 
 VECTOR = spaces.Box(-1, 1, (3,), np.float32)
 IMAGE = spaces.Box(0, 255, (8, 8, 3), np.uint8)
-
-
-@pytest.fixture(autouse=True)
-def _own_directory(tmp_path, monkeypatch):
-    # MuJoCo writes the warnings of a model file into the current directory.
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
@@ -120,10 +117,13 @@ def test_the_shortest_time_limit_counts_as_in_gymnasium(register, own, registere
     assert True in truncated or expected is None
 
 
-def test_wrappers_of_a_task_and_its_keywords_are_kept(register):
+def test_wrappers_of_a_task_its_keywords_and_further_wrappers_are_kept(register):
     scale = gymnasium.wrappers.TransformReward.wrapper_spec(func=_doubled)
     env_id = register(Counter, additional_wrappers=(scale,))
-    assert (GymnasiumBatchEnv(env_id, 2).rollout(3)["next", "reward"] == 2).all()
+    wrappers = [partial(gymnasium.wrappers.RescaleObservation, min_obs=0, max_obs=1)] * 2
+    env = copy.deepcopy(GymnasiumBatchEnv(env_id, 2, wrappers=wrappers))
+    assert env.reset()["observation"].tolist() == [[0.5] * 3] * 2
+    assert (env.rollout(3)["next", "reward"] == 2).all()
     env = GymnasiumBatchEnv("Walker2d-v5", 2, frame_skip=2, render_mode="rgb_array")
     assert [sim.unwrapped.frame_skip for sim in env.envs] == [2, 2]
     assert [sim.render_mode for sim in env.envs] == ["rgb_array", "rgb_array"]
@@ -159,8 +159,7 @@ def test_a_seeded_partial_reset_gives_the_rows_what_a_whole_one_does():
     assert torch.equal(again["observation"][::2], later["observation"][::2])
 
 
-def test_making_writes_no_log_file_and_logs_each_model_warning_once(tmp_path, caplog, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_making_writes_no_log_file_and_logs_each_model_warning_once(tmp_path, caplog):
     with caplog.at_level("INFO"):
         GymnasiumBatchEnv("HalfCheetah-v5", 3)
     assert not any(tmp_path.iterdir())
@@ -168,8 +167,6 @@ def test_making_writes_no_log_file_and_logs_each_model_warning_once(tmp_path, ca
 
 
 def test_an_older_version_asked_for_by_name_gives_no_warning():
-    with pytest.warns(DeprecationWarning, match="Walker2d-v4 is out of date"):
-        gymnasium.make("Walker2d-v4")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         GymnasiumBatchEnv("Walker2d-v4", 2)
@@ -320,13 +317,6 @@ def test_entries_of_a_dictionary_are_joined_in_the_order_asked_for(register):
     for keys in (["b", "x"], []):
         with pytest.raises(ValueError, match=r"`observation_keys` .* it has a, b, c\.$"):
             GymnasiumBatchEnv(env_id, 2, observation_keys=keys)
-
-
-def test_wrappers_of_gymnasium_go_around_each_environment(register):
-    wrappers = [partial(gymnasium.wrappers.RescaleObservation, min_obs=0, max_obs=1)] * 2
-    env = GymnasiumBatchEnv(register(Counter), 2, wrappers=wrappers)
-    env = copy.deepcopy(env)
-    assert env.reset()["observation"].tolist() == [[0.5] * 3] * 2
 
 
 @pytest.mark.parametrize(

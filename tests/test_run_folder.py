@@ -120,11 +120,17 @@ def test_a_bit_that_the_archive_does_not_watch_is_seen_by_the_sum_beside_it(fold
     assert load_checkpoint(path)["progress"]["frames"] == 512
 
 
-def test_a_full_disk_ends_in_one_line_and_the_last_checkpoint_stays(folder, smoke):
+@pytest.mark.parametrize(
+    "share",
+    [pytest.param(0.05, marks=pytest.mark.slow), 0.3, pytest.param(0.9, marks=pytest.mark.slow)],
+)
+def test_a_full_disk_ends_in_one_line_and_the_last_checkpoint_stays(folder, smoke, share):
+    """No file may grow beyond a share of what a checkpoint holds."""
+    size = int(share * last_checkpoint(folder).stat().st_size)
     last_checkpoint(folder).unlink()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
         with refused(r"can't be written: .*before it are kept"):
             resume(folder)
     finally:

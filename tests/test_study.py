@@ -28,7 +28,17 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.cell_sweeper import CellSweeper, continued, run_cell
 from omegaconf import DictConfig, OmegaConf
 from ppo_drbpn import train
-from recipe_tools import CONF, ROOT, command, differences, make_config, read_table, refused, run
+from recipe_tools import (
+    CONF,
+    ROOT,
+    assert_same_run,
+    command,
+    differences,
+    make_config,
+    read_table,
+    refused,
+    run,
+)
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.console import STOP_FILE, StopRequest
@@ -259,15 +269,15 @@ def test_a_signal_stops_a_sweep_and_every_cell_is_saved(start, tmp_path, launche
 
 @pytest.mark.slow
 def test_a_sweep_goes_on_after_it_was_killed(start, tmp_path):
-    words = ("seed=0", "method=none", "checkpoint.every_frames=128")
+    words = ("seed=0", "method=none", "checkpoint.every_frames=128", "total_frames=2048")
     process = start(*words)
     (folder,) = wait_for_rows(tmp_path, 1)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     reached = checkpoint_frames(folder) or 0
-    again = start(*words, f"total_frames={reached + 256}")
-    said, _ = again.communicate(timeout=240)
-    assert again.returncode == 0, said
-    assert f"going on at {reached:,} steps" in said
-    frames = [int(row["frames"]) for row in read_table(folder / "metrics.csv")]
-    assert frames == list(range(128, reached + 257, 128))  # none is missing, none there twice
+    for where in ("out", "straight"):
+        again = start(*words, f"hydra.sweep.dir={where}")
+        said, _ = again.communicate(timeout=240)
+        assert again.returncode == 0, said
+        assert (f"going on at {reached:,} steps" in said) == (where == "out")
+    assert_same_run(tmp_path / "straight" / folder.name, folder)

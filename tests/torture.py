@@ -1,17 +1,10 @@
-"""What a run survives: kills at random moments, a full disk. Longer than the suite.
+"""Runs that are killed by SIGKILL at random moments and resumed. Longer than the suite.
 
-``python tests/torture.py`` (about 20 minutes on a quiet machine) or ``--quick`` (about one).
-Prints one line a class with its counts, in between what has been tried (on stderr), and leaves with
-status 1 where a count is not as it must be. Classes named go alone, in any order and at any time:
-``python tests/torture.py sweep`` draws the moments that the whole run draws for it.
-
-kills      50 runs of every belief and algorithm, killed at random moments and resumed
-sweep      8 kills of a sweep and its cells
-full_disk  20 runs of which no file may grow beyond a random size
-
-Every run is a process of its own that is killed by SIGKILL at a random moment, resumed, killed
-again, and let go on to its end. It then equals the run that nobody stopped, to the last bit: its
-tables and its last checkpoint. What can't go on says so in one line and leaves what was there.
+``python tests/torture.py`` (about 10 minutes on a quiet machine) or ``--quick`` (about one) kills
+runs of every belief and algorithm, each a process of its own: killed, resumed, killed again, and
+let go on to its end. It then equals the run that nobody stopped, to the last bit: its tables and
+its last checkpoint. Prints the counts, in between what has been tried (on stderr), and leaves with
+status 1 where a run is unlike.
 """
 
 from __future__ import annotations
@@ -19,10 +12,8 @@ from __future__ import annotations
 import argparse
 import os
 import random
-import resource
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -31,7 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
-from recipe_tools import ROOT, differences, make_config, read_table, resume, run
+from recipe_tools import differences, make_config, read_table, resume, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
 from training.console import say
@@ -52,9 +43,6 @@ CASES = {
     "none acktr": ("belief=none", "algo=acktr", "algo.critic.steps=3", "collector.num_envs=4",
                    "collector.steps_per_env=32"),
 }  # fmt: skip
-
-
-# Processes ------------------------------------------------------------------------------------
 
 
 class Process:
@@ -93,11 +81,6 @@ class Process:
         os.waitpid(self.pid, 0)
         return None
 
-    def is_one_line(self) -> bool:
-        """Return whether it ended in one line of an error."""
-        text = self.log.read_text(errors="replace")
-        return text.count("error: ") == 1 and "Traceback" not in text
-
 
 def starts(folder: Path, words: tuple[str, ...]) -> Callable[[], int]:
     """Return the job that starts a run, or goes on with it where it has got to a checkpoint."""
@@ -125,11 +108,8 @@ def unequal(first: Path, second: Path) -> list[str]:
 
 
 def progress(text: str) -> None:
-    """Print how far a class has got."""
+    """Print how far it has got."""
     print(f"  {text}", file=sys.stderr, flush=True)  # noqa: T201
-
-
-# Classes --------------------------------------------------------------------------------------
 
 
 def kills(work: Path, draw: random.Random, count: int) -> list[str]:
@@ -162,104 +142,19 @@ def kills(work: Path, draw: random.Random, count: int) -> list[str]:
     return wrong
 
 
-def sweep(work: Path, draw: random.Random, count: int) -> list[str]:
-    """Kill a sweep and its cells; the same command goes on."""
-
-    def command(folder: Path) -> subprocess.Popen[bytes]:
-        words = ["study=smoke", f"hydra.sweep.dir={folder}"]
-        log = folder.with_suffix(".log").open("ab")
-        recipe = str(ROOT / "recipes" / "ppo_drbpn.py")
-        return subprocess.Popen(
-            [sys.executable, recipe, *words], cwd=work, stdout=log, stderr=log,
-            start_new_session=True,
-        )  # fmt: skip
-
-    straight, killed = work / "sweep-straight", work / "sweep-killed"
-    clock = time.perf_counter()
-    if command(straight).wait():
-        return [f"the sweep failed: {straight.with_suffix('.log').read_text()[-500:]}"]
-    seconds = time.perf_counter() - clock
-    for number in range(count):
-        job = command(killed)
-        try:
-            job.wait(draw.uniform(0.2, 1) * seconds)
-        except subprocess.TimeoutExpired:
-            os.killpg(job.pid, signal.SIGKILL)
-            job.wait()
-        progress(f"sweep: kill {number + 1} of {count}")
-    status = command(killed).wait()
-    cells = sorted(path.name for path in straight.iterdir() if path.is_dir())
-    wrong = [] if status == 0 else [f"the sweep ended with status {status}"]
-    for cell in cells:
-        wrong += [f"{cell}: {line}" for line in unequal(straight / cell, killed / cell)]
-    say(
-        f"sweep: {count} kills of {len(cells)} cells; cells unlike those not killed: "
-        f"{len({line.split(':')[0] for line in wrong})}"
-    )
-    return wrong
-
-
-def full_disk(work: Path, draw: random.Random, count: int) -> list[str]:
-    """Let no file grow beyond a random size, in a run that goes on from its middle."""
-    straight, seed = work / "disk-straight", work / "disk-seed"
-    finished(straight, CASES["drbpn"])
-    shutil.copytree(straight, seed)
-    last_checkpoint(seed).unlink()
-    wrong, refused = [], 0
-    size = last_checkpoint(seed).stat().st_size
-    for number in range(count):
-        folder = shutil.copytree(seed, work / f"disk-{number}")
-        limit = draw.randrange(5000, size)  # what it says needs room too
-
-        def job(folder: Path = folder, limit: int = limit) -> int:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-            return resume(folder)
-
-        process = Process(job, work / "log")
-        status = process.ends()
-        if status != 2 or not process.is_one_line():
-            wrong.append(f"limit {limit}: status {status}\n{process.log.read_text()[-800:]}")
-        else:
-            refused += 1
-        finished(folder, CASES["drbpn"])
-        wrong += [f"limit {limit}: {line}" for line in unequal(straight, folder)]
-        shutil.rmtree(folder)
-        progress(f"full disk: {number + 1} of {count}, {len(wrong)} wrong so far")
-    say(
-        f"full disk: {refused} of {count} ended in one line; went on unlike the one that had "
-        f"room: {len(wrong) - (count - refused)}"
-    )
-    return wrong
-
-
-CLASSES = {
-    "kills": (kills, 6, 50),
-    "sweep": (sweep, 1, 8),
-    "full_disk": (full_disk, 2, 20),
-}
-
-
 def main() -> int:
-    """Run every class; return the status."""
+    """Kill the runs; return the status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "classes", nargs="*", choices=[*CLASSES, []], help="all where none is given"
-    )
     parser.add_argument("--quick", action="store_true", help="about a minute")
-    parser.add_argument("--seed", type=int, default=0, help="of every random moment and place")
+    parser.add_argument("--seed", type=int, default=0, help="of every random moment")
     words = parser.parse_args()
     make_config()  # imports what Hydra imports late, once for all forks
-    wrong = []
-    for name in words.classes or CLASSES:
-        torment, few, many = CLASSES[name]
-        with tempfile.TemporaryDirectory() as work:
-            draw = random.Random(f"{words.seed} {name}")
-            found = torment(Path(work), draw, few if words.quick else many)
-        for line in found:
-            say(f"WRONG {name}: {line}")
-        wrong += found
+    with tempfile.TemporaryDirectory() as work:
+        wrong = kills(Path(work), random.Random(words.seed), 6 if words.quick else 50)
+    for line in wrong:
+        say(f"WRONG {line}")
     return int(bool(wrong))
 
 
