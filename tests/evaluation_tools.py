@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
+import diagnose as diagnosis
 import evaluate as recipe
 from evaluation.conditions import Condition, parse_condition
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
-from recipe_tools import ROOT
+from recipe_tools import ROOT, read_table
 
 
 def configured(command: str = "evaluate", *overrides: str) -> dict[str, Any]:
@@ -24,13 +24,13 @@ def parse(text: str, settings: DictConfig) -> Condition:
     return parse_condition(text, settings, spike_std=5.0)
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def evaluate(table: Path, *runs: Path, points: str = "", **options: Any) -> list[dict[str, str]]:
     base = configured("evaluate", *([f"points=[{points}]"] if points else []))
     base |= {"run": [str(r) for r in runs], "output": str(table), "processes": 1, "episodes": 2}
     assert recipe.run(base | {"figures": False} | options) == 0
-    return read_rows(table)
+    return read_table(table)
+
+
+def diagnose(folders: Any, out: Path | None, **changes: Any) -> int:
+    few = {"points": ["trained"], "episodes": 2, "seed": 4, "bins": [1, 2, 3, 6], "resamples": 20}
+    return diagnosis.run(configured("diagnose") | few | {"run": folders, "out": out} | changes)

@@ -6,6 +6,7 @@ import contextlib
 import copy
 import csv
 import functools
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -23,7 +24,8 @@ from training.run_folder import resumed_config
 
 __all__ = [
     "BELIEFS", "CONF", "ROOT", "SMOKE", "TIMES", "assembled", "assert_same_run", "command",
-    "differences", "make_config", "make_folder", "read_table", "refused", "resume", "run", "saved",
+    "differences", "make_config", "make_folder", "printed", "read_table", "refused", "resume",
+    "run", "saved",
 ]  # fmt: skip
 
 ROOT = Path(__file__).parents[1]
@@ -88,18 +90,25 @@ def make_folder(folder: Path, *overrides: str) -> Path:
 
 
 def command(
-    recipe: str, *words: str, cwd: Path, env: dict[str, str] | None = None
+    script: Path | str, *words: str, cwd: Path, **env: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run a recipe as a person does."""
+    """Run a script of the repository as a person does."""
     return subprocess.run(
-        [sys.executable, str(ROOT / "recipes" / recipe), *words],
+        [sys.executable, str(ROOT / script), *words],
         cwd=cwd,
-        env=env,
+        env={**os.environ, **env},
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=600,
         check=False,
     )
+
+
+def printed(script: Path | str, *words: str, cwd: Path, **env: str) -> str:
+    """Return what a script that ends well has printed."""
+    done = command(script, *words, cwd=cwd, **{"OMP_NUM_THREADS": "1"} | env)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
 
 
 def read_table(path: Path) -> list[dict[str, str]]:

@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from recipe_tools import ROOT, printed
 
-ROOT = Path(__file__).parents[1]
 BENCHMARKS = ROOT / "benchmarks"
 sys.path.append(str(BENCHMARKS))
 
@@ -24,19 +21,6 @@ import interleaved  # noqa: E402
 
 HELPERS = {"interleaved.py"}
 COMMANDS = sorted(p.name for p in BENCHMARKS.glob("*.py") if p.name not in HELPERS)
-
-
-def run(path: Path, folder: Path, *words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, str(path), "--quick", *words],
-        cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
 
 
 def test_the_performance_page_names_every_command():
@@ -50,7 +34,7 @@ def test_the_performance_page_names_every_command():
 def test_a_benchmark_runs_with_quick_and_writes_its_tables(name, tmp_path):
     target = tmp_path / "deep" / "out.json"
     words = ["--beliefs", "none"] if name == "peers.py" else []
-    out = run(BENCHMARKS / name, tmp_path, "--json", str(target), *words)
+    out = printed(BENCHMARKS / name, "--quick", "--json", str(target), *words, cwd=tmp_path)
     assert "torchrl 0." in out
     assert "torch threads 1" in out
     assert all(json.loads(target.read_text()).values())
@@ -59,7 +43,7 @@ def test_a_benchmark_runs_with_quick_and_writes_its_tables(name, tmp_path):
 
 
 def test_the_calibration_example_runs(tmp_path):
-    out = run(ROOT / "docs" / "calibration" / "constant_covariance.py", tmp_path)
+    out = printed("docs/calibration/constant_covariance.py", "--quick", cwd=tmp_path)
     assert "MSE, constant over exact" in out
 
 

@@ -72,7 +72,7 @@ def test_every_default_is_explained_on_its_line_or_above(path):
 
 
 def test_cfg_job_prints_everything_that_is_built(tmp_path):
-    done = command("ppo_drbpn.py", "--cfg", "job", "--resolve", "env=hopper", cwd=tmp_path)
+    done = command("recipes/ppo_drbpn.py", "--cfg", "job", "--resolve", "env=hopper", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     printed = OmegaConf.create(done.stdout)
     assert printed == OmegaConf.create(

@@ -9,10 +9,9 @@ tables and figures whole, the same bytes for the same seed, and answers bad inpu
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 from typing import Any
 
-import diagnose
+import diagnose as recipe
 import pandas as pd
 import pytest
 import torch
@@ -22,25 +21,14 @@ from analysis.calibration_figures import outage_figure
 from analysis.calibration_tables import calibration_rows
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.trained import TrainedAgent, load_trained_agent
-from evaluation_tools import parse, read_rows
+from evaluation_tools import diagnose, parse
 from matplotlib.image import imread
 from omegaconf import OmegaConf
+from recipe_tools import read_table
 from test_calibration_tables import BINS, known_forecasts, steps_with
 from training.run_folder import load_config, write_config
 
 BELIEFS = ("drbpn", "gru", "gru_action", "fill", "none", "dvrl", "transformer")
-DEFAULTS: dict[str, Any] = {
-    "redraw": None,
-    "points": ["trained"],
-    "episodes": 2,
-    "mode": "sampled",
-    "seed": 4,
-    "bins": BINS,
-    "spike_std": 5.0,
-    "reduction_seed": 0,
-    "resamples": 20,
-    "threads": 1,
-}
 
 
 @pytest.fixture(scope="module")
@@ -179,28 +167,24 @@ def test_the_outage_figure_shows_nis_coverage_and_crps_of_every_class():
 # The command -----------------------------------------------------------------------------------
 
 
-def run(folders: Any, out: Path | None, **changes: Any) -> int:
-    return diagnose.run({"run": folders, "out": out, **DEFAULTS, **changes})
-
-
 def test_the_command_leaves_tables_and_figures_and_says_who_has_no_estimate(
     folders, tmp_path, capsys
 ):
     chosen = [str(folders[name]) for name in ("drbpn", "gru", "none")]
     points = ["trained", "mcar:0.4", "none:0"]  # the first two are the same
-    assert run(chosen, tmp_path / "study", points=points) == 0
+    assert diagnose(chosen, tmp_path / "study", points=points) == 0
     left = sorted(path.name for path in (tmp_path / "study").iterdir())
-    figures = [name for name, _ in diagnose.FIGURES.values()]
+    figures = [name for name, _ in recipe.FIGURES.values()]
     assert left == sorted(["precision.csv", "calibration.csv", "reliability.csv", *figures])
     said = capsys.readouterr().out
     assert said.count("none: belief=none keeps no estimate") == 1
-    rows = read_rows(tmp_path / "study" / "precision.csv")
+    rows = read_table(tmp_path / "study" / "precision.csv")
     assert {(r["belief"], r["point"]) for r in rows} == {
         (name, point) for name in ("drbpn", "gru", "none") for point in ("mcar:0.4", "none:0")
     }
     assert all(r["entries"] == "arrived" for r in rows if r["point"] == "none:0")
     assert all(float(r["rmse_low"]) <= float(r["rmse_high"]) for r in rows if r["rmse_low"])
-    found = read_rows(tmp_path / "study" / "calibration.csv")
+    found = read_table(tmp_path / "study" / "calibration.csv")
     assert {r["belief"] for r in found} == {"drbpn", "gru"}
     for name in figures:
         pixels = imread(tmp_path / "study" / name)[..., :3]
@@ -208,7 +192,7 @@ def test_the_command_leaves_tables_and_figures_and_says_who_has_no_estimate(
     figure = tmp_path / "study" / "outages.png"
     first = figure.read_bytes()
     figure.unlink()
-    assert run(None, None, redraw=str(tmp_path / "study")) == 0
+    assert diagnose(None, None, redraw=str(tmp_path / "study")) == 0
     assert figure.read_bytes() == first
 
 
@@ -216,15 +200,15 @@ def test_the_same_seed_gives_the_same_bytes_beside_the_run_where_no_folder_is_na
     folders, tmp_path
 ):
     folder = shutil.copytree(folders["drbpn"], tmp_path / "drbpn")
-    assert run(str(folder), None) == 0
-    assert run(str(folder), tmp_path / "out") == 0
+    assert diagnose(str(folder), None) == 0
+    assert diagnose(str(folder), tmp_path / "out") == 0
     for path in (tmp_path / "out").iterdir():
         assert path.read_bytes() == (folder / path.name).read_bytes(), path.name
 
 
 def test_every_point_of_an_evaluation_can_be_diagnosed(folders, tmp_path):
     points = ["reduction:0.5:random", "noise:30", "spikes:0.5"]
-    assert run(str(folders["drbpn"]), tmp_path, points=points) == 0
+    assert diagnose(str(folders["drbpn"]), tmp_path, points=points) == 0
     rows = pd.read_csv(tmp_path / "precision.csv")
     assert set(rows.point) == {"reduction:0.5:random", "noise:30", "spikes:0.5:5"}
     # Removed sensors are never seen: all that is missing is of that class.
@@ -242,8 +226,8 @@ def test_runs_of_one_kind_are_pooled_and_those_of_two_methods_are_not(folders, t
     twin, plain = (shutil.copytree(folders["drbpn"], tmp_path / n) for n in ("twin", "plain"))
     write_config(twin, OmegaConf.merge(load_config(twin), {"seed": 1}))
     write_config(plain, OmegaConf.merge(load_config(plain), {"method": "no_likelihood"}))
-    assert run([str(folders["drbpn"]), str(twin), str(plain)], tmp_path / "out") == 0
-    rows = read_rows(tmp_path / "out" / "precision.csv")
+    assert diagnose([str(folders["drbpn"]), str(twin), str(plain)], tmp_path / "out") == 0
+    rows = read_table(tmp_path / "out" / "precision.csv")
     assert {(row["run"], row["method"], row["runs"]) for row in rows} == {
         ("drbpn", "drbpn", "1"),
         ("twin", "drbpn", "1"),
@@ -260,7 +244,7 @@ def test_runs_of_one_kind_are_pooled_and_those_of_two_methods_are_not(folders, t
 
 
 def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(folders, tmp_path):
-    assert run(str(folders["gru"]), tmp_path) == 0
-    assert run(str(folders["fill"]), tmp_path) == 0
+    assert diagnose(str(folders["gru"]), tmp_path) == 0
+    assert diagnose(str(folders["fill"]), tmp_path) == 0
     left = {path.name for path in tmp_path.iterdir()}
     assert left - {"precision.png"} == {"precision.csv"}  # few entries are not drawn

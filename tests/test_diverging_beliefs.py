@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import diagnose as diagnose_recipe
 import numpy as np
 import pytest
@@ -12,8 +9,9 @@ import torch
 from analysis.calibration import diagnose
 from evaluation.table import Protocol, evaluate_condition
 from evaluation.trained import load_trained_agent
-from evaluation_tools import evaluate, parse, read_rows
-from recipe_tools import refused
+from evaluation_tools import diagnose as run_diagnosis
+from evaluation_tools import evaluate, parse
+from recipe_tools import read_table, refused
 from training.config import explained
 
 from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
@@ -22,14 +20,6 @@ from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
 @pytest.fixture(scope="module")
 def trained(drbpn):
     return load_trained_agent(drbpn)
-
-
-def run_diagnosis(folder: Path, out: Path, **changes: Any) -> int:
-    usual = {
-        "run": str(folder), "out": out, "redraw": None, "episodes": 2, "mode": "sampled", "seed": 4,
-        "bins": [1, 2, 3, 6], "spike_std": 5.0, "reduction_seed": 0, "resamples": 50, "threads": 1,
-    }  # fmt: skip
-    return diagnose_recipe.run(usual | changes)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
@@ -123,11 +113,11 @@ def test_a_point_where_a_belief_diverges_is_left_out_with_a_line(
         return whole(trained, condition, removed, **how)
 
     monkeypatch.setattr(diagnose_recipe, "diagnose", diverging)
-    assert run_diagnosis(drbpn, tmp_path, points=["mcar:0.8", "mcar:0.4"]) == 0
+    assert run_diagnosis(str(drbpn), tmp_path, points=["mcar:0.8", "mcar:0.4"]) == 0
     assert "drbpn, mcar:0.8: no rows, the belief is no longer finite" in capsys.readouterr().out
-    assert {row["point"] for row in read_rows(tmp_path / "precision.csv")} == {"mcar:0.4"}
+    assert {row["point"] for row in read_table(tmp_path / "precision.csv")} == {"mcar:0.4"}
     with refused("no point is left: every belief diverged"):
-        run_diagnosis(drbpn, tmp_path, points=["mcar:0.8"])
+        run_diagnosis(str(drbpn), tmp_path, points=["mcar:0.8"])
 
 
 def test_an_error_of_the_filter_is_one_line_of_every_command(capsys):

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import ast
 import importlib
-import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
+from recipe_tools import ROOT, printed
 
-ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 PACKAGE = ROOT / "torchrl_drbpn"
 PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
@@ -203,17 +200,10 @@ def test_the_script_of_the_guide_imports_core_dependencies_alone():
     assert modules <= {"__future__", "torch", "tensordict", "torchrl", "torchrl_drbpn"}
 
 
-def printed_by(script: Path, **kwargs: Any) -> str:
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=600, check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"}, **kwargs,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
-
-
 def test_the_sensors_of_the_faulty_simulator_fail_as_the_page_says():
-    shares = [float(s) for s in re.findall(r"in (0\.\d+) of the steps", printed_by(SIMULATOR))]
+    shares = [
+        float(s) for s in re.findall(r"in (0\.\d+) of the steps", printed(SIMULATOR, cwd=ROOT))
+    ]
     late = 1 - (2 / 3) ** 3  # of 3 delays one at least brings a reading
     started = 1 - 1.2 / 50  # nearly nothing arrives at the first two steps
     stuck = 0.01 / 0.06 * (1 - (1 - 0.94**50) / (50 * 0.06))  # from sensors that all work
@@ -223,7 +213,7 @@ def test_the_sensors_of_the_faulty_simulator_fail_as_the_page_says():
 
 @pytest.mark.slow
 def test_the_script_of_the_guide_runs_elsewhere_and_learns(tmp_path):
-    printed = printed_by(Path(shutil.copy(SCRIPT, tmp_path)), cwd=tmp_path)
-    first, last = map(float, re.findall(r"20 episodes ([\d.]+).*last 20 ([\d.]+)", printed)[0])
+    text = printed(Path(shutil.copy(SCRIPT, tmp_path)), cwd=tmp_path)
+    first, last = map(float, re.findall(r"20 episodes ([\d.]+).*last 20 ([\d.]+)", text)[0])
     assert last > 3 * first
-    assert re.findall(r"missing 0\.(\d\d)", printed)[0] in {"28", "29", "30", "31", "32"}
+    assert re.findall(r"missing 0\.(\d\d)", text)[0] in {"28", "29", "30", "31", "32"}

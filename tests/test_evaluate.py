@@ -24,8 +24,8 @@ from evaluation.episodes import over_episodes
 from evaluation.folders import find_folders, override
 from evaluation.table import evaluate_tasks
 from evaluation.trained import load_trained_agent
-from evaluation_tools import configured, evaluate, read_rows
-from recipe_tools import refused
+from evaluation_tools import configured, evaluate
+from recipe_tools import read_table, refused
 from training.run_folder import read_config, write_config
 
 
@@ -97,7 +97,7 @@ def test_an_evaluation_that_was_killed_goes_on_to_the_same_bytes(drbpn, tmp_path
     monkeypatch.setattr(table_room, "evaluate_condition", dies)
     with pytest.raises(KeyboardInterrupt):
         evaluate(broken, drbpn, points=points)
-    assert {row["point"] for row in read_rows(broken)} == {"none:0"}
+    assert {row["point"] for row in read_table(broken)} == {"none:0"}
     evaluate(broken, drbpn, points=points)
     assert len(calls) == 2 + 2  # the finished condition was not evaluated again
     assert broken.read_bytes() == whole.read_bytes()
@@ -235,7 +235,7 @@ def test_a_robust_update_changes_what_spikes_do_and_its_table_has_a_name_of_its_
     believed = evaluate(tmp_path / "out.csv", folder, points=points)
     base = configured("evaluate", f"points=[{points}]", "robust=huber") | {"run": str(folder)}
     assert recipe.run(base | {"processes": 1, "episodes": 2, "figures": False}) == 0
-    weighted = read_rows(folder / "points-huber4.0.csv")
+    weighted = read_table(folder / "points-huber4.0.csv")
     assert not (folder / "points.csv").exists()
     assert {row["method"] for row in believed} == {"drbpn"}
     assert {row["method"] for row in weighted} == {"drbpn, huber 4"}

@@ -19,7 +19,7 @@ import export as recipe
 import pytest
 import torch
 from evaluation_tools import ROOT, configured
-from recipe_tools import refused
+from recipe_tools import printed, refused
 
 DEPLOY = ROOT / "docs" / "deploy"
 WALKER = ROOT / "agents" / "walker2d"
@@ -105,11 +105,8 @@ def walked(script: str, policy: Path) -> float:
     modules = {alias.name for node in tree if isinstance(node, ast.Import) for alias in node.names}
     runtime = "onnxruntime" if policy.suffix == ".onnx" else "torch"
     assert modules == {"sys", "gymnasium", "numpy", runtime}
-    done = subprocess.run(
-        [sys.executable, str(DEPLOY / script), str(policy)],
-        capture_output=True, text=True, timeout=300, check=True, cwd=policy.parent,
-    )  # fmt: skip
-    return float(re.findall(r"return (-?\d+)", done.stdout)[0])
+    text = printed(DEPLOY / script, str(policy), cwd=policy.parent)
+    return float(re.findall(r"return (-?\d+)", text)[0])
 
 
 def test_the_program_without_torch_walks(tmp_path):

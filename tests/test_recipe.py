@@ -131,7 +131,7 @@ def test_evaluation_leaves_the_whole_training_alone():
 
 def test_the_command_runs_from_any_directory(tmp_path):
     words = ("experiment=smoke", "total_frames=128", "evaluation.final_episodes=1")
-    done = command("ppo_drbpn.py", *words, cwd=tmp_path)
+    done = command("recipes/ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "steps/s in collection and update" in done.stdout
     (folder,) = (tmp_path / "runs").iterdir()
@@ -150,7 +150,7 @@ def test_the_command_runs_from_any_directory(tmp_path):
     ],
 )
 def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(tmp_path, words, line):
-    done = command("ppo_drbpn.py", *words, cwd=tmp_path)
+    done = command("recipes/ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert line in done.stderr

@@ -120,10 +120,7 @@ def test_a_bit_that_the_archive_does_not_watch_is_seen_by_the_sum_beside_it(fold
     assert load_checkpoint(path)["progress"]["frames"] == 512
 
 
-@pytest.mark.parametrize(
-    "share",
-    [pytest.param(0.05, marks=pytest.mark.slow), 0.3, pytest.param(0.9, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("share", [0.08, 0.9])
 def test_a_full_disk_ends_in_one_line_and_the_last_checkpoint_stays(folder, smoke, share):
     """No file may grow beyond a share of what a checkpoint holds."""
     size = int(share * last_checkpoint(folder).stat().st_size)

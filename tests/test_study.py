@@ -200,7 +200,7 @@ def sweep(folder: Path, rates: str, launcher: str = "basic") -> subprocess.Compl
         "hydra.sweep.dir=out",
         f"hydra/launcher={launcher}",
     )
-    return command("ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=folder)
+    return command("recipes/ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=folder)
 
 
 @pytest.mark.slow
