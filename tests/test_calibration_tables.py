@@ -139,9 +139,6 @@ def test_nis_by_class_are_those_of_the_rows_of_a_class_alone():
     assert sums["nis_joint"].item() == pytest.approx((2 * 4 + 2 * 16 - 2 * 8) / 3)
 
 
-# Intervals -------------------------------------------------------------------------------------
-
-
 def test_an_interval_over_few_episodes_holds_the_mean_as_often_as_it_claims():
     """Plain percentiles hold it in .91 of the cases; .007 is a standard error of 1000 trials."""
     generator = torch.Generator().manual_seed(0)
@@ -159,9 +156,6 @@ def test_nothing_to_count_is_an_empty_cell_and_one_episode_has_no_interval():
     for numerator, denominator in ((torch.zeros(3), torch.zeros(3)), (None, one)):
         assert set(resampling.ratio("x", numerator, denominator).values()) == {None}
     assert resampling.ratio("x", 2 * one, one) == {"x": 2.0, "x_low": None, "x_high": None}
-
-
-# Scores of Gaussian predictions ------------------------------------------------------------------
 
 
 def randn(*shape: int, seed: int = 0) -> Tensor:

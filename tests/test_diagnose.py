@@ -50,9 +50,6 @@ def point(tally: Tally, estimate: str, entries: str) -> dict[str, torch.Tensor]:
     return tally.sums[Compared(estimate, None, "truth", entries)]
 
 
-# What is counted -----------------------------------------------------------------------------
-
-
 def test_steps_since_last_seen_are_those_a_plain_loop_counts(agents, monkeypatch):
     held: list[dict[str, torch.Tensor]] = []
     add = Tally.add
@@ -77,9 +74,6 @@ def test_steps_since_last_seen_are_those_a_plain_loop_counts(agents, monkeypatch
     counts = point(tally, "filtered", "missing")["count"]
     assert counts.sum() == (~steps["observed"] & running).sum()
     assert tally.missing_ratio == pytest.approx(0.4, abs=0.12)
-
-
-# What beliefs offer ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["drbpn", "gru", "gru_action", "transformer"])
@@ -138,9 +132,6 @@ def test_the_truth_is_before_the_noise_and_readings_are_after_it(agents):
     assert rmse == pytest.approx(expected, rel=0.5)
 
 
-# Figures ---------------------------------------------------------------------------------------
-
-
 def test_the_outage_figure_shows_nis_coverage_and_crps_of_every_class():
     tally = known_forecasts(0.5)
     kind = {"task": "Task-v5", "point": "mcar:0.4", "method": "sure", "trained_on": "none"}
@@ -162,9 +153,6 @@ def test_the_outage_figure_shows_nis_coverage_and_crps_of_every_class():
     assert drawn[0][0][1][0] == pytest.approx(4, rel=0.1)
     assert drawn[1][0][1][0] == pytest.approx(0.673, abs=0.03)
     assert outage_figure(table[table["held_against"] == "truth"]) is None
-
-
-# The command -----------------------------------------------------------------------------------
 
 
 def test_the_command_leaves_tables_and_figures_and_says_who_has_no_estimate(

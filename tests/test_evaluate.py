@@ -34,9 +34,6 @@ def agent(drbpn):
     return load_trained_agent(drbpn)
 
 
-# Episodes -------------------------------------------------------------------------------------
-
-
 def test_more_episodes_only_add(trained_run, tmp_path, monkeypatch):
     """Starts, gaps, noise, spikes, outages, actions and particles, across blocks of simulators."""
     monkeypatch.setattr(episodes_room, "BLOCK", 3)
@@ -64,9 +61,6 @@ def test_a_small_share_of_one_entry_weighs_as_what_it_is():
     assert found.missing_ratio == pytest.approx((0.2 * 10 + 0.6 * 30) / 40)
     assert found.log_likelihood == pytest.approx((1.0 * 8 + 2.0 * 12) / 20)
     assert (found.return_mean, found.diverged, found.episodes) == (1.5, 0.5, 2)
-
-
-# The table ------------------------------------------------------------------------------------
 
 
 def test_one_row_an_episode_and_a_baseline_only_at_random(drbpn, feedforward, tmp_path, capsys):
@@ -173,9 +167,6 @@ def test_a_foreign_table_is_not_overwritten(drbpn, tmp_path, text):
     assert out.read_text() == text
 
 
-# Folders --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "name", ["a=b", "a,b", "[ab]", "a b", "it's", 'a"b', "a*", "$HOME", "eta={0.5}", "back\\slash"]
 )
@@ -210,9 +201,6 @@ def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(drbpn, tmp_pat
     assert "young: left out, it has no checkpoint yet" in capsys.readouterr().out
     with refused("young` holds no checkpoint"):
         evaluate(tmp_path / "out.csv", young, points="none:0")
-
-
-# Settings -------------------------------------------------------------------------------------
 
 
 def test_the_full_list_of_a_task_without_sensor_names_has_no_groups(agent, capsys):

@@ -29,9 +29,6 @@ def settings(agent):
     return agent.settings
 
 
-# Conditions -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("text", "name"),
     [
@@ -145,9 +142,6 @@ def test_each_family_changes_what_the_agent_gets(drbpn, tmp_path):
     assert mean("drift:0:1", "log_likelihood") < mean("noise:0", "log_likelihood")
     # A reading that is 5 off is not what the model expects.
     assert mean("spikes:1:5", "log_likelihood") < mean("noise:0", "log_likelihood")
-
-
-# Sensors that are removed ---------------------------------------------------------------------
 
 
 def removed_at_random(ratio: float, trained: TrainedAgent, episodes: int, seed: int = 0) -> Any:

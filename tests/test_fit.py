@@ -57,7 +57,6 @@ def write(table: pd.DataFrame, path: Path) -> Path:
     return path
 
 
-# ---------------------------------------------------------------------------------- reading a log
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
 def test_every_kind_of_file_is_the_same_log(tmp_path, suffix):
     _, table = logged(3, 6)
@@ -129,7 +128,6 @@ def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, cel
     assert not Path("out").exists()
 
 
-# ---------------------------------------------------------------------------------------- training
 def test_episodes_are_split_and_every_one_is_somewhere():
     for episodes, sizes in ((2, (1, 1, 1)), (3, (1, 1, 1)), (10, (6, 2, 2)), (50, (30, 10, 10))):
         parts = split(episodes, 0.2, seed=0)
@@ -248,7 +246,6 @@ def test_what_is_hidden_was_there_and_is_the_share_asked_for_in_stretches():
     assert torch.equal(hidden, hide(observed, 0.3, 10.0, seed=0))
 
 
-# ----------------------------------------------------------------------------------- the command
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fit")

@@ -55,9 +55,6 @@ def observe(optimizer: KFAC, module: nn.Module, inputs: Tensor, score: Tensor) -
     return output
 
 
-# The factors ----------------------------------------------------------------------------------
-
-
 def test_the_factors_of_a_linear_gaussian_layer_are_its_exact_fisher_matrix(generator):
     layer = network(generator, 3, 2)[0]
     inputs, std = normal(generator, N, 3), torch.tensor([0.5, 2.0], dtype=torch.float64)
@@ -98,9 +95,6 @@ def test_the_curvature_of_every_layer_is_a_weighted_mean_of_what_was_observed(ge
             torch.testing.assert_close(state[key] / (1 - decay**3), mean)
 
 
-# The direction --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("samples", [N, 2], ids=["full rank", "deficient"])
 def test_the_natural_gradient_solves_with_the_damped_kronecker_matrix(generator, samples):
     a, g = kronecker_factors(normal(generator, samples, 4), normal(generator, samples, 3))
@@ -136,9 +130,6 @@ def test_the_step_of_a_parameter_of_constant_fisher_information_divides_by_it():
     torch.testing.assert_close(before - log_std.detach(), log_std.grad / 2.5)
 
 
-# The length -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("max_kl", [1e-4, 0.3])
 def test_a_long_step_is_shortened_to_the_divergence_asked_for(generator, max_kl):
     """The divergence of a linear Gaussian model is quadratic: here the prediction is the truth."""
@@ -167,9 +158,6 @@ def test_the_steps_are_averaged_by_momentum():
     assert positions[1] == pytest.approx(-0.5 * 0.1)
     assert positions[2] - positions[1] == pytest.approx(-0.5 * 0.1 * 1.9)
     assert positions[-1] - positions[-2] == pytest.approx(-0.5)
-
-
-# The state ------------------------------------------------------------------------------------
 
 
 def test_a_step_before_any_curvature_is_refused(generator):

@@ -68,9 +68,6 @@ def pixels_of(film: Film, panel: int, row: float, window: int = 4) -> tuple[Any,
     return int(film.height - box.y1 + row * box.height), columns.astype(int)
 
 
-# The recording --------------------------------------------------------------------------------
-
-
 def test_a_recording_is_the_first_episode_of_an_evaluation(drbpn, tmp_path):
     whole = record(drbpn, steps=100_000)
     rows = evaluate(tmp_path / "t.csv", drbpn, points="'mcar:0.5'", seed=4, modes=["sampled"])
@@ -106,9 +103,6 @@ def test_the_sensors_that_miss_most_are_chosen_in_the_order_of_the_observation(r
     one = dataclasses.replace(recording, observed=observed)
     assert chosen_sensors(one, 2) == [1, 3]
     assert chosen_sensors(one, ["pole angle", 0]) == [1, 0]
-
-
-# Files ----------------------------------------------------------------------------------------
 
 
 def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(drbpn, tmp_path, capsys):
@@ -159,9 +153,6 @@ def test_a_png_is_the_figure_of_the_belief_the_same_bytes_each_time(drbpn, tmp_p
     pixels = imread(tmp_path / "a.png")[..., :3]
     assert 0.01 < (pixels.min(-1) < 0.9).mean() < 0.9
     assert near(255 * pixels, ABSENT).mean() > 0.01
-
-
-# Frames ---------------------------------------------------------------------------------------
 
 
 def test_a_frame_shows_masks_and_gaps_up_to_its_step_and_nothing_after(recording):
@@ -234,9 +225,6 @@ def test_a_task_that_is_not_mujocos_is_drawn_where_its_state_can_be_set(monkeypa
         camera.picture(Closed())
 
 
-# Points and beliefs ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("belief", "kind", "has_interval"),
     [("none", "nothing", False), ("fill", "estimate", False), ("gru", "forecast", True)],
@@ -251,9 +239,6 @@ def test_another_belief_shows_what_it_says_and_no_more(
     assert np.isfinite(recording.estimate).all() == (kind != "nothing")
     assert near(make_film(recording)[-1], BELIEF, 60).any() == (kind != "nothing")
     assert show(other, tmp_path / "belief.png", steps=2) == 0
-
-
-# Bad input ------------------------------------------------------------------------------------
 
 
 def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(drbpn):

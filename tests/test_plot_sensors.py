@@ -68,9 +68,6 @@ def filtered(model: SensorModel, rows: list[int]) -> torch.Tensor:
     ).cov
 
 
-# The model --------------------------------------------------------------------------------------
-
-
 def test_the_observation_covariance_is_that_of_a_step_inside_an_episode(agents, models):
     module = BeliefFilterModule(
         agents[0].agent.belief.filter, out_keys=[("belief", "innovation_cov")]
@@ -101,9 +98,6 @@ def test_spikes_count_as_noise_that_was_added(agents):
     torch.testing.assert_close(spiky, 2 * quiet)
 
 
-# The choice -------------------------------------------------------------------------------------
-
-
 def test_the_kept_sensors_are_the_first_of_the_ranking(agents, models):
     ranking = models[0].ranking("D").tolist()
     assert sorted(ranking) == list(range(OBS))
@@ -116,9 +110,6 @@ def test_a_covariance_that_depends_on_the_state_ranks_no_sensors(runs):
     trained.agent.belief.filter.transition = GaussianTransition(OBS, ACTION, cov_network=True)
     with refused("`belief=drbpn` predicts another covariance at every"):
         learned_sensors(trained)
-
-
-# What is drawn ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("full", [False, True], ids=["diagonal R", "full R"])
@@ -150,8 +141,6 @@ def test_mean_places_count_from_one(models):
     both = (places + mean_places(models[1:2], "D")) / 2
     np.testing.assert_array_equal(mean_places(models[:2], "D"), both)
 
-
-# The recipe -------------------------------------------------------------------------------------
 
 FILES = ["observation_covariance.png", "sensor_ranking.csv", "sensor_ranking.png"]
 

@@ -34,8 +34,6 @@ from training.checkpoint import last_checkpoint
 from training.console import BAR, show
 from training.run_folder import read_config
 
-# What a run leaves ----------------------------------------------------------------------------
-
 
 def test_a_run_leaves_configuration_tables_checkpoints_and_versions(smoke):
     assert read_config(smoke)["missingness"]["eta"] == 0.2
@@ -104,9 +102,6 @@ def test_a_logger_that_is_not_installed_is_one_line_and_leaves_nothing(tmp_path,
     assert not list((tmp_path / "run").iterdir())
 
 
-# One seed, one result -------------------------------------------------------------------------
-
-
 def test_one_seed_gives_one_result_and_another_seed_another(smoke, tmp_path):
     run(tmp_path / "again", *SMOKE)
     assert_same_run(smoke, tmp_path / "again")
@@ -124,9 +119,6 @@ def test_evaluation_leaves_the_whole_training_alone():
     assert [row["episodes"] for row in rows] == [3, 3]
     assert evaluate_training(config, training, "training", 3, lambda: True) is None
     assert differences(before, saved(training.state_dict())) == []
-
-
-# The command line ------------------------------------------------------------------------------
 
 
 def test_the_command_runs_from_any_directory(tmp_path):
@@ -195,9 +187,6 @@ def test_a_closed_pipe_does_not_stop_a_run(tmp_path):
     assert job.wait(timeout=240) == 0
     assert len(read_table(tmp_path / "run" / "metrics.csv")) == 2
     assert last_checkpoint(tmp_path / "run").name == "frames_000000000256.pt"
-
-
-# It learns ---------------------------------------------------------------------------------------
 
 
 def improvement(folder: Path, *overrides: str) -> float:

@@ -7,7 +7,6 @@ user gets wrong is one line.
 
 from __future__ import annotations
 
-import functools
 import json
 import shutil
 from pathlib import Path
@@ -35,9 +34,6 @@ STUDIES = sorted(path.parent for path in (ROOT / "results").glob("*/runs.csv"))
 WRITTEN = ("summary.csv", "aggregate.csv", "comparison.csv", "README.md")
 
 
-# Run folders ------------------------------------------------------------------------------------
-
-
 def episodes(returns: dict[str, tuple[float, ...]], mode: str = "sampled") -> list[dict[str, Any]]:
     """Rows of recipes/evaluate.py: of two episodes of a point the second is three times as long."""
     return [
@@ -48,9 +44,7 @@ def episodes(returns: dict[str, tuple[float, ...]], mode: str = "sampled") -> li
     ]
 
 
-@functools.cache
-def composed(*overrides: str) -> Any:
-    return make_config("env=hopper", "env.version=v4", "total_frames=400", *overrides)
+HOPPER = ("env=hopper", "env.version=v4", "total_frames=400")
 
 
 def make_run(
@@ -63,13 +57,12 @@ def make_run(
 ) -> Path:
     """Write what a run leaves behind."""
     folder.mkdir(parents=True)
-    write_config(folder, OmegaConf.merge(composed(*overrides), {"seed": seed}))
+    write_config(folder, OmegaConf.merge(make_config(*HOPPER, *overrides), {"seed": seed}))
     (folder / "versions.json").write_text(json.dumps({"torch": "2.13.0", "git_commit": "abc"}))
-    last = {"episodes": 200, "return": final, "missing_ratio": 0.3, "log_likelihood": 1.5}
-    first = {"episodes": 0, "return": None, "missing_ratio": 0.1, "log_likelihood": 1.5}
-    rows = [{"frames": n, **(first if n == frames[0] else last)} for n in frames]
-    speeds = [{"steps_per_second": 100.0 if n == frames[0] else 200.0} for n in frames]
-    curve = pd.DataFrame([row | speed for row, speed in zip(rows, speeds, strict=True)])
+    numbers = {"episodes": 200, "return": final, "missing_ratio": 0.3, "log_likelihood": 1.5}
+    curve = pd.DataFrame({"frames": frames, **numbers, "steps_per_second": 200.0})
+    start = {"episodes": 0, "return": np.nan, "missing_ratio": 0.1, "steps_per_second": 100.0}
+    curve.loc[0, list(start)] = list(start.values())
     curve.to_csv(folder / "metrics.csv", index=False)
     numbers = {"return_std": 1.0, "length_mean": 9.0, "missing_ratio": 0.25, "log_likelihood": 1.0}
     evaluations = [
@@ -108,9 +101,6 @@ def seeds(tmp_path):
     return [make_run(tmp_path / "runs" / f"s{i}", seed=i, final=value) for i, value in finals]
 
 
-# Statistics -------------------------------------------------------------------------------------
-
-
 def test_the_interquartile_mean_leaves_out_a_quarter_on_each_side():
     values = np.array([[100.0, 1.0, 2.0, 3.0], [-7.0, 5.0, 5.0, 90.0]])
     assert interquartile_mean(values).tolist() == [2.5, 5.0]
@@ -142,14 +132,11 @@ def test_the_probability_of_improvement_counts_pairs():
     assert ratio(first, second[:2]) == 2.0
 
 
-# Names ------------------------------------------------------------------------------------------
-
-
 def test_a_run_is_called_by_its_belief_unless_it_is_named():
-    config = composed("belief=gru")
+    config = make_config(*HOPPER, "belief=gru")
     assert method_name(config) == "gru"
     assert method_name({**config} | {"method": "mine"}) == "mine"
-    assert method_name(composed("belief=gru", "algo=acktr")) == "gru (acktr)"
+    assert method_name(make_config(*HOPPER, "belief=gru", "algo=acktr")) == "gru (acktr)"
 
 
 def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it():
@@ -163,9 +150,6 @@ def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it():
     assert missingness_name(outages).endswith(":20:sensor")
 
 
-# Tables -----------------------------------------------------------------------------------------
-
-
 def test_means_over_seeds_stand_beside_every_seeds_own_number(seeds):
     summary = tables(seeds)["summary"]
     training = row(summary, "training")
@@ -176,7 +160,7 @@ def test_means_over_seeds_stand_beside_every_seeds_own_number(seeds):
     assert row(summary, "mar:0.5", "mean")["return"] == 60  # the run's own, at the end
 
 
-def test_a_share_is_a_ratio_of_means(tmp_path):
+def test_a_share_is_a_ratio_of_means_and_no_mean_lacks_a_seed(tmp_path):
     points = [
         {"none:0": (90.0, 110.0), "mcar:0.5": (85.0,)},
         {"none:0": (10.0,), "mcar:0.5": (20.0,)},
@@ -185,11 +169,8 @@ def test_a_share_is_a_ratio_of_means(tmp_path):
     half = row(tables(folders)["summary"], "mcar:0.5")
     assert half["return"] == (85 + 20) / 2
     assert half.share == pytest.approx((85 + 20) / (100 + 10))  # not (0.85 + 2) / 2
-
-
-def test_a_mean_that_lacks_a_seed_is_not_given(seeds):
-    (seeds[1] / "robustness.csv").unlink()
-    points = set(tables(seeds)["summary"].point)
+    (folders[1] / "robustness.csv").unlink()
+    points = set(tables(folders)["summary"].point)
     assert "mcar:0.5" not in points
     assert "training" in points
 
@@ -220,19 +201,15 @@ def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path):
         for i, kind in enumerate(kinds)
         for seed in (0, 1)
     ]
+    for seed, folder in enumerate(folders[:2]):  # what follows the seed is no difference
+        more = {"collector_seed": seed, "transforms": {"own": {"seed": seed}}}
+        write_config(folder, read_config(folder) | more)
     summary = tables(folders)["summary"]
     training = summary[summary.point == "training"]
     assert sorted(training["return"]) == [10.0 * i for i in range(len(kinds))]
     assert (training.seeds == 2).all()
     assert training[training["return"] == 10.0].settings.tolist() == ["optim.lr=0.1"]
     assert training[training["return"] == 50.0].method.tolist() == ["ppo_ours"]
-
-
-def test_settings_that_follow_the_seed_are_no_difference(seeds):
-    for seed, folder in enumerate(seeds):
-        more = {"collector_seed": seed, "transforms": {"own": {"seed": seed}}}
-        write_config(folder, read_config(folder) | more)
-    assert row(tables(seeds)["summary"], "training").seeds == 3
 
 
 def test_the_reference_is_compared_where_half_is_missing_and_at_equal_steps(tmp_path):
@@ -281,9 +258,6 @@ def test_learning_curves_are_thinned_over_the_whole_run(seeds):
     np.testing.assert_allclose(curve.missing_ratio, [0.2, 0.3])
 
 
-# Making it again --------------------------------------------------------------------------------
-
-
 def test_the_tables_alone_give_the_same_page_and_keep_the_notes(seeds, tmp_path):
     out = tmp_path / "out"
     report(seeds, out, title="Three seeds")
@@ -329,9 +303,6 @@ def test_results_stay_small():
     assert len(STUDIES) >= 12
 
 
-# The figure of an evaluation --------------------------------------------------------------------
-
-
 def test_an_evaluation_draws_methods_noise_and_runs_of_one_seed_apart():
     def rows(run, method, sigma, value):
         table = pd.DataFrame(episodes({"mcar:0.2": (value,), "mcar:0.5": (value,)}, "mean"))
@@ -375,9 +346,6 @@ def test_a_run_without_evaluation_or_finished_episode_is_reported(tmp_path):
     curve = pd.read_csv(folder / "metrics.csv").assign(**{"return": None})
     write_table(folder / "metrics.csv", curve)
     assert "## Training" in report([folder], tmp_path / "out")
-
-
-# What a user gets wrong -------------------------------------------------------------------------
 
 
 def test_runs_that_are_not_finished_are_refused_unless_asked_for(tmp_path):

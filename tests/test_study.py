@@ -54,9 +54,6 @@ LONG = (
 )
 
 
-# What stands in conf --------------------------------------------------------------------------
-
-
 def compose(words: Sequence[str]) -> DictConfig:
     """Compose a configuration, what Hydra says of its job included."""
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
@@ -128,9 +125,6 @@ def test_the_command_line_wins_over_a_study_and_a_method():
     assert folder_of(cell) == Path("elsewhere/Ant-dvrl-s7")
 
 
-# A cell and its folder ------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
     """A run of 200 steps, rounded up to two rollouts of 128."""
@@ -188,9 +182,6 @@ def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_othe
     with StopRequest(tmp_path / "stop"):
         os.kill(os.getpid(), signal.SIGTERM)
         assert run_cell(broken, tmp_path / "cell") == ("cell", "stopped")
-
-
-# Sweeps ---------------------------------------------------------------------------------------
 
 
 def sweep(folder: Path, rates: str, launcher: str = "basic") -> subprocess.CompletedProcess[str]:
