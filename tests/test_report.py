@@ -201,7 +201,8 @@ def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path):
         for i, kind in enumerate(kinds)
         for seed in (0, 1)
     ]
-    for seed, folder in enumerate(folders[:2]):  # what follows the seed is no difference
+    for seed, folder in zip((0, 1) * len(kinds), folders, strict=True):
+        # What follows the seed is no difference.
         more = {"collector_seed": seed, "transforms": {"own": {"seed": seed}}}
         write_config(folder, read_config(folder) | more)
     summary = tables(folders)["summary"]
