@@ -1,7 +1,5 @@
 """What holds for every test: the native filter is this checkout's, global states are given back."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

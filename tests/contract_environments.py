@@ -1,7 +1,5 @@
 """Environments and helpers that the contracts share; see contracts.py."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

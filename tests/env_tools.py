@@ -1,7 +1,5 @@
 """What the tests of every environment over MuJoCo tasks share: the tasks, actions, stepping."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDictBase

@@ -1,7 +1,5 @@
 """What the tests of evaluate, diagnose and play share: the commands as they are called."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the tests of the recipe share: composing configurations, comparing what runs leave."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import csv

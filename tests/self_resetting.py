@@ -1,7 +1,5 @@
 """An environment that starts the next episode by itself, as TorchRL's native auto-reset ones do."""
 
-from __future__ import annotations
-
 from contracts import StaircaseEnv
 from tensordict import TensorDict, TensorDictBase
 

@@ -5,8 +5,6 @@ some steps (terminated) or the time limit comes first (truncated), so that a rol
 holds both ends inside rows, and the second one begins in mid-episode.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@ A rollout is learned from by natural-gradient steps: the value comes nearer to i
 divergence of the policy is steered to the one asked for. A stopped run goes on to the last bit.
 """
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

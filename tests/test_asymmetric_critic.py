@@ -1,7 +1,5 @@
 """heads.critic_input=complete: the value reads the complete observation, the policy never does."""
 
-from __future__ import annotations
-
 import functools
 
 import pytest

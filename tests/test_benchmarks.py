@@ -5,8 +5,6 @@ runs, and the ratio of two candidates comes from pairs of one round. Speed itsel
 test that fails on a loaded machine tells nothing.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

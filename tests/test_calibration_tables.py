@@ -4,8 +4,6 @@ Errors are sorted by the steps since a sensor was last seen; a belief that is ri
 and covers what it claims, a wrong one has not.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """What the commands of the recipes can not do is said in one line, before anything is done."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 

@@ -4,8 +4,6 @@ What has a `_target_` takes exactly the keys that stand beside it. What a person
 answered with one line that names the setting, and the nearest one where there is none of that name.
 """
 
-from __future__ import annotations
-
 import pytest
 from evaluation.points import missingness_kind, missingness_name
 from omegaconf import OmegaConf

@@ -6,8 +6,6 @@ sensors is asked for it by the same names, and what it writes is what it acts on
 tables and figures whole, the same bytes for the same seed, and answers bad input in one line.
 """
 
-from __future__ import annotations
-
 import shutil
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Beliefs that leave the range of their numbers, under test: what they stop, and what not."""
 
-from __future__ import annotations
-
 import diagnose as diagnose_recipe
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What the pages are held to: they name what exists, leave nothing out, and their code runs."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

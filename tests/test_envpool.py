@@ -6,8 +6,6 @@ and a contact that begins a step earlier multiplies that by a thousand. For them
 is compared from equal states, and the first steps of a run.
 """
 
-from __future__ import annotations
-
 import copy
 import pickle
 

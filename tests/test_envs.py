@@ -1,7 +1,5 @@
 """Specification of the batches of simulators: what holds over Gymnasium and over EnvPool."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -5,8 +5,6 @@ conditions: one that was stopped goes on, to the same bytes as one that was not,
 settings. Folders are found whatever their names hold.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import shlex
 import shutil

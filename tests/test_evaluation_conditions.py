@@ -3,8 +3,6 @@
 A condition names one thing and leaves the rest as in training; its full name reads back to itself.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

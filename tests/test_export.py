@@ -5,8 +5,6 @@ not be exported is one line and leaves no file; the programs of docs/deploy walk
 was exported, in Python without TorchRL, without torch, and in C++.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import shutil

@@ -4,8 +4,6 @@ Each command of the pages trains, from any directory and by the command line alo
 every belief module hold for the pages' example.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

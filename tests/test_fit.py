@@ -6,8 +6,6 @@ system the fit comes close to the system's own likelihood and its intervals cove
 is written is what an agent starts from.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Specification of what `GymnasiumBatchEnv` alone promises, beside test_envs.py."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import sys

@@ -1,7 +1,5 @@
 """The house rules of `CONTRIBUTING.md`, held statically."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import importlib.metadata

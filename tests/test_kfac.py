@@ -5,8 +5,6 @@ the step solves with the damped matrix, moves no further than the trust region, 
 saved state as if it had never stopped.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

@@ -7,8 +7,6 @@ the mask and the gaps up to its step; the belief where there is one, the sensors
 is none. Pictures of the robot are needed by nothing else. Bad input is answered with one line.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 from pathlib import Path

@@ -7,8 +7,6 @@ state's basis.
 The recipe writes two pictures and a table, whole, and answers bad input with one line.
 """
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

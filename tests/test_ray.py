@@ -1,7 +1,5 @@
 """`collector=ray`: one run whose simulators and policies are in workers on two nodes."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

@@ -5,8 +5,6 @@ training, and the agent learns. What stops a run: test_resume.py, test_run_folde
 test_recipe_faults.py.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import subprocess

@@ -5,8 +5,6 @@ filling keeps the last value. What else one does that others do not stands in
 test_transformer_belief.py, test_belief_filter_module.py and test_particle_filter.py.
 """
 
-from __future__ import annotations
-
 import functools
 
 import pytest

@@ -5,8 +5,6 @@ goes on with new episodes, says so in one line, and keeps everything else: weigh
 statistics, counters. Without EnvPool the answer is one line.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 

@@ -3,8 +3,6 @@
 It ends in one line that says at which step, and what was saved is good.
 """
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -5,8 +5,6 @@ values by hand. Runs are averaged over seeds only; a mean that lacks a seed is n
 user gets wrong is one line.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

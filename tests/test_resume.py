@@ -3,8 +3,6 @@
 The tables and the last checkpoint equal those of a run that nobody stopped, to the last bit.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """A run folder that can't be used is answered with one line, and what is in it stays."""
 
-from __future__ import annotations
-
 import fcntl
 import random
 import resource

@@ -1,7 +1,5 @@
 """An agent saved by itself: it acts as the run did, and its card says how it was trained."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import play

@@ -1,7 +1,5 @@
 """Names of sensors and what fails together by them."""
 
-from __future__ import annotations
-
 import gymnasium
 import pytest
 from omegaconf import OmegaConf

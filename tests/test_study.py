@@ -6,8 +6,6 @@ before its first checkpoint starts anew; other settings are refused. One that fa
 whatever runs the cells: one after another, joblib, submitit.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

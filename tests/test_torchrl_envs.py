@@ -1,7 +1,5 @@
 """Specification of `env=torchrl`: any environment of TorchRL in the place of ours."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -7,8 +7,6 @@ its last checkpoint. Prints the counts, in between what has been tried (on stder
 status 1 where a run is unlike.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random
