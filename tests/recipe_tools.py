@@ -13,18 +13,11 @@ from typing import Any
 
 import pytest
 import torch
-from contract_environments import saved
 from omegaconf import DictConfig
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.errors import UserError
 from training.run_folder import resumed_config
-
-__all__ = [
-    "BELIEFS", "CONF", "ROOT", "SMOKE", "TIMES", "assembled", "assert_same_run", "command",
-    "differences", "make_config", "make_folder", "printed", "read_table", "refused", "resume",
-    "run", "saved",
-]  # fmt: skip
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"

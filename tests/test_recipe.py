@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from contracts import saved
 from evaluation.trained import evaluate_training
 from ppo_drbpn import train_rollout
 from recipe_tools import (
@@ -25,7 +26,6 @@ from recipe_tools import (
     read_table,
     refused,
     run,
-    saved,
 )
 from tqdm import tqdm
 from training.checkpoint import last_checkpoint

@@ -10,10 +10,10 @@ import functools
 import pytest
 import torch
 from beliefs import Belief
-from contracts import ACTION, OBS, RecipeBeliefContract
+from contracts import ACTION, OBS, RecipeBeliefContract, saved
 from omegaconf import DictConfig
 from ppo_drbpn import train_rollout
-from recipe_tools import BELIEFS, assembled, differences, make_config, refused, saved
+from recipe_tools import BELIEFS, assembled, differences, make_config, refused
 from torchrl.modules import set_recurrent_mode
 from training.config import build
 from training.run_folder import metric_columns

@@ -7,10 +7,8 @@ import re
 
 import pytest
 import torch
-from ppo_drbpn import train_rollout
-from recipe_tools import SMOKE, assembled, read_table, refused, resume, run
+from recipe_tools import SMOKE, read_table, refused, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint
-from training.errors import DivergedError
 
 
 @pytest.mark.parametrize("belief", ["drbpn", "gru", "none"])
@@ -36,8 +34,9 @@ def test_a_run_that_diverges_later_names_its_last_good_checkpoint(tmp_path, monk
 
     monkeypatch.setattr(ppo_drbpn, "collect", spoilt)
     folder = tmp_path / "run"
-    kept = rf"at 256 steps: .* Its last checkpoint, at 256 steps, is in {re.escape(str(folder))}"
-    with refused(kept):
+    what = r"at 256 steps: the (loss|weight|gradient) `.*` is (nan|inf)"
+    kept = rf"Its last checkpoint, at 256 steps, is in {re.escape(str(folder))}"
+    with refused(f"{what}.* {kept}"):
         run(folder, *SMOKE, "checkpoint.every_frames=128")
     assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
     assert "final" not in (folder / "evaluation.csv").read_text()
@@ -101,11 +100,3 @@ def test_an_engine_that_resets_itself_is_counted_and_said_once(tmp_path, monkeyp
     printed = "".join(capsys.readouterr())
     assert printed.count("reset it") == 1
     assert "Warning" not in printed
-
-
-def test_a_weight_that_is_none_is_named():
-    training, config = assembled(*SMOKE)
-    with torch.no_grad():
-        training.agent.critic.module[0].bias[3] = torch.inf
-    with pytest.raises(DivergedError, match=r"the (loss|weight|gradient) `.*` is (nan|inf)"):
-        train_rollout(training, config)
