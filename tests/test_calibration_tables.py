@@ -16,7 +16,6 @@ from analysis.calibration_tables import (
     precision_rows,
     reliability_rows,
 )
-from torch import Tensor
 
 BINS = [1, 2, 3, 6]
 READINGS = Compared("predicted", True, "reading", "arrived")
@@ -156,10 +155,6 @@ def test_nothing_to_count_is_an_empty_cell_and_one_episode_has_no_interval():
     assert resampling.ratio("x", 2 * one, one) == {"x": 2.0, "x_low": None, "x_high": None}
 
 
-def randn(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 @pytest.mark.parametrize("std", [0.2, 1.0, 3.0])
 @pytest.mark.parametrize("value", [-2.5, 0.3, 4.0])
 def test_the_crps_equals_the_integral_of_its_definition(value, std):
@@ -174,7 +169,7 @@ def test_the_crps_equals_the_integral_of_its_definition(value, std):
 
 
 def test_the_crps_without_a_spread_is_the_absolute_error():
-    value, mean = randn(10, seed=1), randn(10, seed=2)
+    value, mean = torch.randn(2, 10, dtype=torch.float64)
     zero = torch.zeros(10, dtype=torch.float64)
     torch.testing.assert_close(gaussian_crps(value, mean, zero), (value - mean).abs())
     assert (gaussian_crps(value, value, zero) == 0).all()
