@@ -16,6 +16,7 @@ DOCS = ROOT / "docs"
 PACKAGE = ROOT / "torchrl_drbpn"
 PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 SCRIPT = DOCS / "guide" / "library_example.py"
+TRAINER = DOCS / "guide" / "trainer_example.py"
 GUIDE = DOCS / "guide" / "belief_in_your_ppo.md"
 FAULTS = DOCS / "faults.md"
 SIMULATOR = DOCS / "faults" / "faulty_simulator.py"
@@ -171,12 +172,13 @@ def blocks_of(page: Path, language: str = "python") -> list[str]:
     ("blocks", "script"),
     [
         (blocks_of(GUIDE), SCRIPT),
+        (blocks_of(DOCS / "guide" / "ppo_trainer.md")[:-1], TRAINER),
         (blocks_of(FAULTS), SIMULATOR),
         (blocks_of(DOCS / "deploy.md"), DOCS / "deploy" / "control_loop.py"),
         (blocks_of(EXTENDING)[:1], EXAMPLE / "drift.py"),
         (blocks_of(EXTENDING)[1:], EXAMPLE / "cautious.py"),
     ],
-    ids=["guide", "faults", "deploy", "transform", "loss"],
+    ids=["guide", "trainer", "faults", "deploy", "transform", "loss"],
 )
 def test_the_blocks_of_a_page_are_the_script_and_all_of_it(blocks, script):
     rest = script.read_text(encoding="utf-8")
@@ -192,10 +194,11 @@ def test_the_blocks_of_a_page_are_the_script_and_all_of_it(blocks, script):
     assert entry == (EXAMPLE / "conf/belief/moving_average.yaml").read_text(encoding="utf-8")
 
 
-def test_the_script_of_the_guide_imports_core_dependencies_alone():
-    text = SCRIPT.read_text(encoding="utf-8")
+@pytest.mark.parametrize("script", [SCRIPT, TRAINER], ids=["loop", "trainer"])
+def test_the_scripts_of_the_guide_import_core_dependencies_alone(script):
+    text = script.read_text(encoding="utf-8")
     modules = set(re.findall(r"^\s*(?:import|from) (\w+)", text, re.MULTILINE))
-    assert modules <= {"__future__", "torch", "tensordict", "torchrl", "torchrl_drbpn"}
+    assert modules <= {"__future__", "torch", "tensordict", "torchrl", "torchrl_drbpn", SCRIPT.stem}
 
 
 def test_the_sensors_of_the_faulty_simulator_fail_as_the_page_says():
@@ -210,8 +213,10 @@ def test_the_sensors_of_the_faulty_simulator_fail_as_the_page_says():
 
 
 @pytest.mark.slow
-def test_the_script_of_the_guide_runs_elsewhere_and_learns(tmp_path):
-    text = printed(Path(shutil.copy(SCRIPT, tmp_path)), cwd=tmp_path)
+@pytest.mark.parametrize("script", [SCRIPT, TRAINER], ids=["loop", "trainer"])
+def test_the_scripts_of_the_guide_run_elsewhere_and_learn(script, tmp_path):
+    shutil.copy(SCRIPT, tmp_path)
+    text = printed(Path(shutil.copy(script, tmp_path)), cwd=tmp_path)
     first, last = map(float, re.findall(r"20 episodes ([\d.]+).*last 20 ([\d.]+)", text)[0])
     assert last > 3 * first
     assert re.findall(r"missing 0\.(\d\d)", text)[0] in {"28", "29", "30", "31", "32"}

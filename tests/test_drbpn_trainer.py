@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+from pathlib import Path
+
 import pytest
 import torch
 from small_agents import (
@@ -141,3 +144,29 @@ def test_ends_marked_as_final_before_they_are_stored_count_in_slices_too():
     batch = sliced(data)
     stored = data["final"].flatten()[batch["index"].flatten()]
     assert torch.equal(loss.model_loss.last_steps(batch), stored)
+
+
+def test_an_epoch_of_the_guides_trainer_takes_every_step_once_from_a_ratio_of_one(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "docs" / "guide")
+    guide = importlib.import_module("trainer_example")
+    monkeypatch.setattr(guide, "TOTAL_FRAMES", 2 * guide.NUM_ENVS * guide.STEPS)
+    trainer = guide.make_trainer()
+    assert trainer.num_epochs == guide.EPOCHS
+    trainer.num_epochs = 2
+    epochs: list[list[torch.Tensor]] = []
+    losses = trainer.loss_module.forward
+    out: list[TensorDictBase] = []
+    monkeypatch.setattr(
+        trainer.loss_module, "forward", lambda batch: out.append(losses(batch)) or out[-1]
+    )
+    trainer.register_op("pre_epoch", lambda batch: epochs.append([]) or batch)
+    trainer.register_op("process_optim_batch", lambda b: epochs[-1].append(b["index"]) or b)
+    trainer.train()
+    steps = torch.arange(guide.NUM_ENVS * guide.STEPS)
+    assert len(epochs) == 4
+    for epoch in epochs:
+        assert len(epoch) == guide.MINIBATCHES
+        assert torch.equal(torch.cat(epoch).flatten().sort().values, steps)
+    for first in out[:: 2 * guide.MINIBATCHES]:  # before the parameters of the rollout change
+        torch.testing.assert_close(first["ESS"], torch.ones_like(first["ESS"]))
+        assert first["max_ratio"].item() == pytest.approx(1, abs=1e-5)

@@ -25,6 +25,7 @@ ALLOWED = {
     "transforms": HOST | {"functional"},
     "envs": HOST | {"numpy", "gymnasium", "mujoco", "envpool"},
     "objectives": HOST | {"functional", "modules"},
+    "configs": {"torchrl", "hydra", "modules", "transforms", "objectives"},
 }
 
 
