@@ -1,17 +1,30 @@
-"""Runs that are killed by SIGKILL at random moments and resumed. Longer than the suite.
+"""What a run survives: kills, a full disk, flipped bits, planted files. Longer than the suite.
 
-``python tests/torture.py`` (about 10 minutes on a quiet machine) or ``--quick`` (about one) kills
-runs of every belief and algorithm, each a process of its own: killed, resumed, killed again, and
-let go on to its end. It then equals the run that nobody stopped, to the last bit: its tables and
-its last checkpoint. Prints the counts, in between what has been tried (on stderr), and leaves with
-status 1 where a run is unlike.
+``python tests/torture.py`` (about 20 minutes on a quiet machine) or ``--quick`` (about one).
+Prints one line a class with its counts, in between what has been tried (on stderr), and leaves with
+status 1 where a count is not as it must be. Classes named go alone, in any order and at any time:
+``python tests/torture.py sweep planted`` draws the moments that the whole run draws for these two.
+
+kills         50 runs of every belief and algorithm, killed at random moments and resumed
+sweep         8 kills of a sweep and its cells
+full_disk     20 runs of which no file may grow beyond a random size
+flipped_bits  800 flipped bits of a checkpoint
+planted       14 kinds of foreign or damaged files in a run folder
+
+Every run is a process of its own that is killed by SIGKILL at a random moment, resumed, killed
+again, and let go on to its end. It then equals the run that nobody stopped, to the last bit: its
+tables and its last checkpoint. What can't go on says so in one line and leaves what was there.
 """
+
+from __future__ import annotations
 
 import argparse
 import os
 import random
+import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -20,10 +33,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
-from recipe_tools import differences, make_config, read_table, resume, run
+from recipe_tools import ROOT, differences, make_config, read_table, resume, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
 from training.console import say
+from training.errors import UserError
 
 TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 SMALL = ("experiment=smoke", "total_frames=768", "checkpoint.every_frames=128",
@@ -41,6 +55,9 @@ CASES = {
     "none acktr": ("belief=none", "algo=acktr", "algo.critic.steps=3", "collector.num_envs=4",
                    "collector.steps_per_env=32"),
 }  # fmt: skip
+
+
+# Processes ------------------------------------------------------------------------------------
 
 
 class Process:
@@ -79,6 +96,11 @@ class Process:
         os.waitpid(self.pid, 0)
         return None
 
+    def is_one_line(self) -> bool:
+        """Return whether it ended in one line of an error."""
+        text = self.log.read_text(errors="replace")
+        return text.count("error: ") == 1 and "Traceback" not in text
+
 
 def starts(folder: Path, words: tuple[str, ...]) -> Callable[[], int]:
     """Return the job that starts a run, or goes on with it where it has got to a checkpoint."""
@@ -106,8 +128,11 @@ def unequal(first: Path, second: Path) -> list[str]:
 
 
 def progress(text: str) -> None:
-    """Print how far it has got."""
+    """Print how far a class has got."""
     print(f"  {text}", file=sys.stderr, flush=True)  # noqa: T201
+
+
+# Classes --------------------------------------------------------------------------------------
 
 
 def kills(work: Path, draw: random.Random, count: int) -> list[str]:
@@ -140,19 +165,204 @@ def kills(work: Path, draw: random.Random, count: int) -> list[str]:
     return wrong
 
 
+def sweep(work: Path, draw: random.Random, count: int) -> list[str]:
+    """Kill a sweep and its cells; the same command goes on."""
+
+    def command(folder: Path) -> subprocess.Popen[bytes]:
+        words = ["study=smoke", f"hydra.sweep.dir={folder}"]
+        log = folder.with_suffix(".log").open("ab")
+        recipe = str(ROOT / "recipes" / "ppo_drbpn.py")
+        return subprocess.Popen(
+            [sys.executable, recipe, *words], cwd=work, stdout=log, stderr=log,
+            start_new_session=True,
+        )  # fmt: skip
+
+    straight, killed = work / "sweep-straight", work / "sweep-killed"
+    clock = time.perf_counter()
+    if command(straight).wait():
+        return [f"the sweep failed: {straight.with_suffix('.log').read_text()[-500:]}"]
+    seconds = time.perf_counter() - clock
+    for number in range(count):
+        job = command(killed)
+        try:
+            job.wait(draw.uniform(0.2, 1) * seconds)
+        except subprocess.TimeoutExpired:
+            os.killpg(job.pid, signal.SIGKILL)
+            job.wait()
+        progress(f"sweep: kill {number + 1} of {count}")
+    status = command(killed).wait()
+    cells = sorted(path.name for path in straight.iterdir() if path.is_dir())
+    wrong = [] if status == 0 else [f"the sweep ended with status {status}"]
+    for cell in cells:
+        wrong += [f"{cell}: {line}" for line in unequal(straight / cell, killed / cell)]
+    say(
+        f"sweep: {count} kills of {len(cells)} cells; cells unlike those not killed: "
+        f"{len({line.split(':')[0] for line in wrong})}"
+    )
+    return wrong
+
+
+def full_disk(work: Path, draw: random.Random, count: int) -> list[str]:
+    """Let no file grow beyond a random size, in a run that goes on from its middle."""
+    straight, seed = work / "disk-straight", work / "disk-seed"
+    finished(straight, CASES["drbpn"])
+    shutil.copytree(straight, seed)
+    last_checkpoint(seed).unlink()
+    wrong, refused = [], 0
+    size = last_checkpoint(seed).stat().st_size
+    for number in range(count):
+        folder = shutil.copytree(seed, work / f"disk-{number}")
+        limit = draw.randrange(5000, size)  # what it says needs room too
+
+        def job(folder: Path = folder, limit: int = limit) -> int:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+            return resume(folder)
+
+        process = Process(job, work / "log")
+        status = process.ends()
+        if status != 2 or not process.is_one_line():
+            wrong.append(f"limit {limit}: status {status}\n{process.log.read_text()[-800:]}")
+        else:
+            refused += 1
+        finished(folder, CASES["drbpn"])
+        wrong += [f"limit {limit}: {line}" for line in unequal(straight, folder)]
+        shutil.rmtree(folder)
+        progress(f"full disk: {number + 1} of {count}, {len(wrong)} wrong so far")
+    say(
+        f"full disk: {refused} of {count} ended in one line; went on unlike the one that had "
+        f"room: {len(wrong) - (count - refused)}"
+    )
+    return wrong
+
+
+def flipped_bits(work: Path, draw: random.Random, count: int) -> list[str]:
+    """Flip a bit of a checkpoint, with its sum beside it and without."""
+    folder = work / "bits"
+    finished(folder, CASES["drbpn"])
+    path = last_checkpoint(folder)
+    sums, whole = path.with_name(path.name + ".sha256"), path.read_bytes()
+    kept, wrong = sums.read_text(), []
+    loaded = Counter[bool]()
+    for with_sum in (True, False):
+        sums.write_text(kept) if with_sum else sums.unlink()
+        for _ in range(count):
+            place = draw.randrange(8 * len(whole))
+            damaged = bytearray(whole)
+            damaged[place // 8] ^= 1 << place % 8
+            path.write_bytes(damaged)
+            try:
+                load_checkpoint(path)
+            except UserError as error:
+                if "\n" in str(error) or "go on from `frames_" not in str(error):
+                    wrong.append(f"bit {place}: {error}")
+            else:
+                loaded[with_sum] += 1
+                if with_sum:
+                    wrong.append(f"bit {place} was loaded")
+    say(
+        f"flipped bits: {count - loaded[True]} of {count} refused, with the sum beside it; "
+        f"by the archive's own sums {count - loaded[False]} of {count}"
+    )
+    return wrong
+
+
+def planted(work: Path, draw: random.Random, count: int) -> list[str]:
+    """Put files into a run folder that do not belong there, and go on with the run."""
+    del draw
+    straight, seed = work / "plant-straight", work / "plant-seed"
+    finished(straight, CASES["none"])
+    shutil.copytree(straight, seed)
+    last_checkpoint(seed).unlink()
+
+    def file_for_folder(folder: Path) -> None:
+        shutil.rmtree(folder / "checkpoints")
+        (folder / "checkpoints").write_text("no folder")
+
+    def cut(name: str, size: int) -> Callable[[Path], None]:
+        return lambda folder: os.truncate(folder / name, size)
+
+    def writes(name: str, data: bytes) -> Callable[[Path], object]:
+        return lambda folder: (folder / name).write_bytes(data)
+
+    def folder_for(name: str) -> Callable[[Path], None]:
+        return lambda folder: ((folder / name).unlink(), (folder / name).mkdir())[1]
+
+    latest = last_checkpoint(seed).relative_to(seed)
+    harmless: dict[str, Callable[[Path], object]] = {
+        "frames_zzz.pt": writes("checkpoints/frames_zzz.pt", b"\x00\x01"),
+        "a stale temporary": writes("checkpoints/.frames_000000000512.pt.tmp", b"half"),
+        "a stale table": writes(".metrics.csv.1.tmp", b"half"),
+        "half a row": lambda folder: (folder / "metrics.csv").open("a").write("9999,1."),
+        "a lost evaluation": lambda folder: (folder / "evaluation.csv").unlink(),
+    }
+    harmful: dict[str, Callable[[Path], object]] = {
+        "binary metrics.csv": writes("metrics.csv", bytes(range(256))),
+        "cut header": cut("metrics.csv", 4),
+        "cut checkpoint": cut(str(latest), 5000),
+        "empty checkpoint": cut(str(latest), 0),
+        "binary config.yaml": writes("config.yaml", bytes(range(256))),
+        "empty config.yaml": cut("config.yaml", 0),
+        "a file for the folder of checkpoints": file_for_folder,
+        "a folder for metrics.csv": folder_for("metrics.csv"),
+        "a folder for a checkpoint": folder_for(str(latest)),
+    }
+    wrong, refused, ignored = [], 0, 0
+    for number, (name, plant) in enumerate([*harmless.items(), *harmful.items()][:count]):
+        folder = shutil.copytree(seed, work / f"plant-{number}")
+        plant(folder)
+        before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.suffix == ".pt"}
+        process = Process(lambda folder=folder: resume(folder), work / "log")
+        status = process.ends()
+        if name in harmless:
+            different = unequal(straight, folder) if status == 0 else [process.log.read_text()]
+            left = [] if name == "frames_zzz.pt" else [str(p) for p in folder.rglob(".*.tmp*")]
+            # A table that is gone lacks what the checkpoint believes is in it.
+            wanted = ["evaluation.csv"] if name == "a lost evaluation" else []
+            ignored += different + left == wanted
+            wrong += [f"{name}: {line}" for line in different + left if line not in wanted]
+        else:
+            kept = all(p.is_file() and p.read_bytes() == data for p, data in before.items())
+            good = status == 2 and process.is_one_line() and kept
+            refused += good
+            wrong += [] if good else [f"{name}: status {status}\n{process.log.read_text()[-800:]}"]
+        progress(f"planted: {name}, {len(wrong)} wrong so far")
+    say(
+        f"planted files: {refused} of {len(harmful)} refused in one line, "
+        f"{ignored} of {len(harmless)} without effect"
+    )
+    return wrong
+
+
+CLASSES = {
+    "kills": (kills, 6, 50),
+    "sweep": (sweep, 1, 8),
+    "full_disk": (full_disk, 2, 20),
+    "flipped_bits": (flipped_bits, 100, 400),
+    "planted": (planted, 99, 99),
+}
+
+
 def main() -> int:
-    """Kill the runs; return the status."""
+    """Run every class; return the status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument(
+        "classes", nargs="*", choices=[*CLASSES, []], help="all where none is given"
+    )
     parser.add_argument("--quick", action="store_true", help="about a minute")
-    parser.add_argument("--seed", type=int, default=0, help="of every random moment")
+    parser.add_argument("--seed", type=int, default=0, help="of every random moment and place")
     words = parser.parse_args()
     make_config()  # imports what Hydra imports late, once for all forks
-    with tempfile.TemporaryDirectory() as work:
-        wrong = kills(Path(work), random.Random(words.seed), 6 if words.quick else 50)
-    for line in wrong:
-        say(f"WRONG {line}")
+    wrong = []
+    for name in words.classes or CLASSES:
+        torment, few, many = CLASSES[name]
+        with tempfile.TemporaryDirectory() as work:
+            draw = random.Random(f"{words.seed} {name}")
+            found = torment(Path(work), draw, few if words.quick else many)
+        for line in found:
+            say(f"WRONG {name}: {line}")
+        wrong += found
     return int(bool(wrong))
 
 
