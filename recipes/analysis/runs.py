@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from evaluation.episodes import over_episodes
 from evaluation.points import faults_name, method_name, missingness_name
 from scipy.stats import hmean
 from training.errors import UserError
-from training.run_folder import read_config
+from training.run_folder import read_config, read_table
 
 # A mean is taken over the seeds of one of these.
 GROUP = ["task", "method", "settings", "trained_on", "noise_sigma"]
@@ -49,13 +48,7 @@ _VERSIONS = ("torch", "torchrl", "gymnasium", "mujoco", "git_commit")
 
 @dataclass(frozen=True)
 class Study:
-    """What is known of a study; each table is a CSV file beside its page.
-
-    Attributes:
-        runs: one row a run: :data:`RUN`, frames, return of the last 100 episodes, versions.
-        training: learning curves.
-        evaluation: one row an evaluation of a run at a point.
-    """
+    """What is known of a study; each table is a CSV file beside its page."""
 
     runs: pd.DataFrame
     training: pd.DataFrame
@@ -81,19 +74,6 @@ def write_table(path: Path, rows: Any) -> None:
     pd.DataFrame(rows).to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
 
 
-def read_table(path: Path, needed: Iterable[str]) -> pd.DataFrame:
-    """Read a CSV file; a last row without an end, of a run under way, is left out."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        whole = io.StringIO(text[: text.rfind("\n") + 1])
-        table = pd.read_csv(whole, keep_default_na=False, na_values=[""])
-    except (OSError, ValueError) as error:
-        raise UserError(f"`{path}` can't be read as a table: is it in a run folder?") from error
-    if absent := [name for name in needed if name not in table]:
-        raise UserError(f"`{path}` lacks the columns {', '.join(absent)}: is it another table?")
-    return table
-
-
 def read_runs(
     folders: Sequence[Path],
     further: str | None = None,
@@ -103,14 +83,8 @@ def read_runs(
 ) -> Study:
     """Read run folders, and a ``further`` table of recipes/evaluate.py over several runs.
 
-    Args:
-        folders: run folders.
-        further: path of the table.
-        rows: of a learning curve.
-        unfinished: whether runs that are not at their end are taken as they stand.
-
-    ``settings`` of what comes back lists what differs between runs of one task, method and
-    corruption beside the seed: such runs are never averaged.
+    Learning curves have so many ``rows``. ``settings`` of what comes back lists what differs
+    between runs of one task, method and corruption beside the seed: such runs are never averaged.
     """
     configs = [read_config(folder) for folder in folders]
     needed = ["frames", "return", "missing_ratio"]

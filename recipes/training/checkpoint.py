@@ -16,37 +16,28 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 
 from training.errors import UserError
+from training.run_folder import whole
 
 _FORMAT = "torchrl_drbpn recipe checkpoint 2"
-_OLD = "torchrl_drbpn recipe checkpoint 1"
 _NAME = re.compile(r"frames_\d{12}\.pt")
 
 
 def save_checkpoint(folder: Path, frames: int, state: dict[str, Any], *, keep: int) -> Path:
-    """Write a checkpoint whole or not at all, with its SHA-256 beside it; keep the latest few.
-
-    ``state``: tensors, numbers, texts, and containers of them. If it can't be written, those before
-    it are left alone.
-    """
-    directory = folder / "checkpoints"
-    path = directory / f"frames_{frames:012d}.pt"
-    temporary = directory / f".{path.name}.tmp"
+    """Write a checkpoint whole or not at all, with its SHA-256 beside it; keep the latest few."""
+    path = folder / "checkpoints" / f"frames_{frames:012d}.pt"
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        for stale in directory.glob(".*.tmp"):  # of a writer that was killed: a run is locked
-            stale.unlink()
-        with temporary.open("wb") as file:
-            torch.save({"format": _FORMAT, **state}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        _sum_file(path).write_text(f"{_digest(temporary)}  {path.name}\n", encoding="utf-8")
-        os.replace(temporary, path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole(path) as temporary:
+            with temporary.open("wb") as file:
+                torch.save({"format": _FORMAT, **state}, file)
+                file.flush()
+                os.fsync(file.fileno())
+            _sum_file(path).write_text(f"{_digest(temporary)}  {path.name}\n", encoding="utf-8")
         for old in _checkpoints(folder)[:-keep]:
             old.unlink()
             _sum_file(old).unlink(missing_ok=True)
     # torch.save answers a full disk with a RuntimeError of its archive writer.
     except (OSError, RuntimeError) as error:
-        temporary.unlink(missing_ok=True)
         reason = error.strerror if isinstance(error, OSError) else "is the disk full?"
         raise UserError(
             f"`{path}` can't be written: {reason or error}. Checkpoints before it are kept."
@@ -92,44 +83,34 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint, its sums checked first; a damaged one names the one before it."""
     if not path.is_file():
         raise UserError(f"`{path}` must be a checkpoint; there is no such file.")
-    reason = _damage(path)
-    state: Any = None
-    if reason is None:
-        try:
-            state = torch.load(path, weights_only=True, map_location="cpu")
-        # torch raises what the damaged byte happens to hit: any exception here means the same.
-        except Exception as error:
-            reason = type(error).__name__
-    if reason is not None:
+    try:
+        _check_sums(path)
+        state: Any = torch.load(path, weights_only=True, map_location="cpu")
+    # zipfile and torch raise what the damaged byte happens to hit: any of it means the same.
+    except Exception as error:
+        reason = str(error) if isinstance(error, _WrongSum) else type(error).__name__
         earlier = [other for other in _checkpoints(path.parents[1]) if other.name < path.name]
         before = f" Remove it to go on from `{earlier[-1].name}`." if earlier else ""
         raise UserError(
             f"`{path}` can't be read: it is damaged, truncated or no checkpoint ({reason}).{before}"
-        )
-    if isinstance(state, dict) and state.get("format") == _OLD:
-        raise UserError(
-            f"`{path}` can't be read: it is of version 0.1.0, which the code of commit 2ebd861 "
-            "reads."
-        )
+        ) from error
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise UserError(f"`{path}` is not a checkpoint of this recipe.")
     return state
 
 
-def _damage(path: Path) -> str | None:
-    """Return what is wrong with a file: its own sums first, then the sum of the whole."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entry = archive.testzip()
-        if entry is not None:
-            return f"wrong CRC of {entry}"
-        sums = _sum_file(path)
-        if sums.is_file() and sums.read_text(encoding="utf-8").split()[:1] != [_digest(path)]:
-            return f"not as {sums.name} says"
-    # zipfile has no one error for what is no archive.
-    except Exception as error:
-        return type(error).__name__
-    return None
+class _WrongSum(Exception):
+    """Say which sum is wrong."""
+
+
+def _check_sums(path: Path) -> None:
+    """Check the sums of a checkpoint's entries, then the sum of the whole beside it, if there."""
+    with zipfile.ZipFile(path) as archive:
+        if entry := archive.testzip():
+            raise _WrongSum(f"wrong CRC of {entry}")
+    sums = _sum_file(path)
+    if sums.is_file() and sums.read_text(encoding="utf-8").split()[:1] != [_digest(path)]:
+        raise _WrongSum(f"not as {sums.name} says")
 
 
 @contextmanager

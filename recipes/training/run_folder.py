@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import fcntl
 import importlib.util
 import io
@@ -16,6 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, cast
 
+import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.record.loggers import Logger, MLFlowLogger, get_logger
@@ -41,9 +41,6 @@ _METRICS = (
 )
 
 
-# Files ----------------------------------------------------------------------------------------
-
-
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """Give a file to write to, which takes the name of ``path`` at the end, or goes."""
@@ -61,40 +58,35 @@ def write_whole(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def _csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, head: bool) -> str:
-    file = io.StringIO()
-    writer = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
-    if head:
-        writer.writeheader()
-    writer.writerows(rows)
-    return file.getvalue()
+def read_table(path: Path, needed: Iterable[str], **options: Any) -> pd.DataFrame:
+    """Read a CSV file; a last row without an end was being written, and is left out."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        ended = io.StringIO(text[: text.rfind("\n") + 1])
+        table = pd.read_csv(ended, keep_default_na=False, na_values=[""], **options)
+    except (OSError, ValueError) as error:
+        raise UserError(f"`{path}` can't be read as a table: is it damaged?") from error
+    if absent := [name for name in needed if name not in table]:
+        raise UserError(f"`{path}` lacks the columns {', '.join(absent)}: is it another table?")
+    return table
 
 
 class Table:
-    """Append rows to a CSV file; a resumed run goes on where its checkpoint was.
-
-    The first column is ``frames``: rows after ``up_to_frames`` are dropped; None: nothing is there
-    yet.
-    """
+    """Append rows to a CSV file; rows after ``up_to_frames`` are dropped, None: all of them."""
 
     def __init__(self, path: Path, columns: Sequence[str], up_to_frames: int | None = None) -> None:
-        self.path, self.columns, kept = path, list(columns), []
+        self.path, self.columns = path, list(columns)
+        kept = pd.DataFrame(columns=self.columns)
         if up_to_frames is not None and path.exists():
-            try:
-                # A row that was being written when the machine stopped has no end.
-                lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-                rows = csv.DictReader(line for line in lines if line.endswith("\n"))
-                if "frames" not in (rows.fieldnames or ()):
-                    raise ValueError("no names of columns")
-                kept = [row for row in rows if int(row["frames"]) <= up_to_frames]
-            except (OSError, ValueError, csv.Error) as error:
-                raise UserError(f"`{path}` can't be read as a table: is it damaged?") from error
-        write_whole(path, _csv_text(self.columns, kept, head=True))
+            rows = read_table(path, ["frames"], dtype=str)
+            kept = rows[rows.frames.astype(int) <= up_to_frames].reindex(columns=self.columns)
+        write_whole(path, kept.to_csv(index=False, lineterminator="\n"))
 
-    def append(self, rows: Iterable[Mapping[str, Any]]) -> None:
+    def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Append rows; an absent value or None is an empty cell, others are left out."""
+        table = pd.DataFrame(rows, columns=self.columns, dtype=object)
         with self.path.open("a", encoding="utf-8") as file:
-            file.write(_csv_text(self.columns, rows, head=False))
+            table.to_csv(file, header=False, index=False, lineterminator="\n")
 
 
 def is_evaluated(folder: Path, config: DictConfig) -> bool:
@@ -102,10 +94,11 @@ def is_evaluated(folder: Path, config: DictConfig) -> bool:
     wanted, path = config.evaluation, folder / "evaluation.csv"
     if not wanted.final_episodes:
         return True
-    lines = path.read_text(errors="replace").splitlines() if path.is_file() else []
-    final = ("final", str(wanted.final_episodes))
-    rows = [row for row in csv.DictReader(lines) if (row["kind"], row["episodes"]) == final]
-    return {*wanted.modes} <= {row["mode"] for row in rows}
+    if not path.is_file():
+        return False
+    rows = read_table(path, ["kind", "episodes", "mode"])
+    final = rows[(rows["kind"] == "final") & (rows["episodes"] == wanted.final_episodes)]
+    return {*wanted.modes} <= {*final["mode"]}
 
 
 def load_config(folder: Path) -> DictConfig:
@@ -135,13 +128,9 @@ def read_config(folder: Path) -> dict[str, Any]:
 def resumed_config(composed: DictConfig, overrides: Sequence[str], folder: Path) -> DictConfig:
     """Return the configuration of a run that is continued.
 
-    A larger ``total_frames`` also stretches what is left of the linear learning rate schedule: the
-    run then differs from one that was given the larger number from the start.
-
-    Args:
-        composed: the configuration that the command line gives.
-        overrides: the words of the command line; any that would change the run is refused.
-        folder: the run folder.
+    ``overrides`` are the words of the command line that gave ``composed``; one that would change
+    the run is refused. A larger ``total_frames`` also stretches what is left of the linear learning
+    rate schedule: the run then differs from one that was given the larger number from the start.
     """
     config = load_config(folder)
     for word in overrides:
@@ -204,8 +193,8 @@ def locked(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise UserError(f"`{folder}` is in use by a run that has not ended.") from error
         try:
-            for stale in folder.glob(".*.tmp*"):  # of a writer that was killed
-                stale.unlink()
+            for stale in (*folder.glob(".*.tmp*"), *folder.glob("checkpoints/.*.tmp*")):
+                stale.unlink()  # of a writer that was killed
             yield
         except OSError as error:
             where = error.filename or folder
@@ -231,9 +220,6 @@ def make_logger(
     # get_logger would give a folder of files, which MLflow gave up.
     uri = kwargs["tracking_uri"] or f"sqlite:///{Path(logger_name, 'mlflow.db').absolute()}"
     return MLFlowLogger(exp_name=experiment_name, tracking_uri=uri)
-
-
-# Numbers --------------------------------------------------------------------------------------
 
 
 def metric_columns(more: Iterable[str]) -> list[str]:
