@@ -29,7 +29,7 @@ from tqdm import tqdm
 from training.agent import add_primers, make_agent, start_from_pretrained
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint, save_checkpoint
 from training.config import build, checked, command_line, explained, one_line, run_command
-from training.console import BAR, StopRequest, say, show
+from training.console import BAR, StopRequest, say, show, stop_request
 from training.envs import env_name, make_env
 from training.errors import DivergedError, EnvironmentFault, UserError
 from training.ppo import add_advantages, finished_episodes, rollout_metrics
@@ -49,10 +49,7 @@ from torchrl_drbpn import BeliefDivergedError
 
 
 def assemble(config: DictConfig) -> Training:
-    """Build everything a run needs, from its seed.
-
-    The global generator of torch is seeded here: initial weights and sampled actions come from it.
-    """
+    """Build everything a run needs; weights and actions come from torch's global generator."""
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     env = make_env(config)
@@ -64,16 +61,14 @@ def assemble(config: DictConfig) -> Training:
     steps = build("optim", config.optim, agent.parameters())
     gae = build("advantage", config.advantage)
     gae.set_keys(reward="scaled_reward")
+    made: Any = partial(make_env, config)
+    learned: Any = {"loss": loss, "steps": steps, "gae": gae, "seed": config.seed}
     return Training(
         env=env,
         agent=agent,
-        collector=build(
-            "collector", config.collector, env, agent.policy, partial(make_env, config)
-        ),
+        collector=build("collector", config.collector, env, agent.policy, made),
         gae=gae,
-        algorithm=build(
-            "algo", config.algo, agent, loss=loss, steps=steps, gae=gae, seed=config.seed
-        ),
+        algorithm=build("algo", config.algo, agent, **learned),
         scale_reward=build("normalisation.reward", config.normalisation.reward),
         reward_statistics=ReturnStatistics.start(env.batch_size[0]),
     )
@@ -137,13 +132,12 @@ def train_rollout(
 
 
 def train(config: DictConfig, folder: Path) -> int:
-    """Train an agent to the end, or until a signal; save it; evaluate it.
+    """Train an agent to the end, save and evaluate it; return the exit status.
 
-    With ``resume`` the run goes on from its last checkpoint. Returns the exit status: 0, or 130 or
-    143 where Ctrl-C or SIGTERM stopped the run. It was saved then.
+    The status is 130 or 143 where Ctrl-C or SIGTERM stopped the run; it was saved then.
     """
     training = assemble(config)
-    with locked(folder), StopRequest() as stop:
+    with locked(folder), stop_request() as stop:
         frames = evaluated = None
         if config.resume is None:
             if (folder / "config.yaml").exists():

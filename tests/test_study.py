@@ -39,7 +39,7 @@ from recipe_tools import (
 )
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import composed_config
-from training.console import STOP_FILE, StopRequest
+from training.console import STOP_FILE, stop_request
 
 STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
@@ -177,7 +177,7 @@ def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_othe
     assert run_cell(broken, tmp_path / "cell") == ("cell", "RuntimeError: two lines")
     assert run_cell(lambda: 0, tmp_path / "cell") == ("cell", "")
     monkeypatch.setenv(STOP_FILE, str(tmp_path / "stop"))
-    with StopRequest(tmp_path / "stop"):
+    with stop_request(tmp_path / "stop"):
         os.kill(os.getpid(), signal.SIGTERM)
         assert run_cell(broken, tmp_path / "cell") == ("cell", "stopped")
 

@@ -22,7 +22,7 @@ from hydra.core.utils import JobReturn
 from omegaconf import DictConfig, OmegaConf
 from training.checkpoint import checkpoint_frames
 from training.config import EXPECTED, explain, leaves, one_line
-from training.console import STOP_FILE, StopRequest, say
+from training.console import STOP_FILE, say, stop_request
 from training.errors import UserError
 from training.run_folder import MAY_CHANGE, is_evaluated, load_config, locked
 
@@ -32,15 +32,9 @@ _FAILED = 1
 _LINES = 11  # joblib's verbose: over 10 it prints a line a run, with the time left
 
 
-# A cell ---------------------------------------------------------------------------------------
-
-
 def run_cell(job: Callable[[], int], folder: Path) -> tuple[str, str]:
-    """Run a cell; whatever happens in it, those after it have their turn.
-
-    Returns its name, and why it is not done in one line: empty where it is.
-    """
-    with StopRequest() as stop:
+    """Run a cell, whatever happens in it; return its name, and in a line why it is not done."""
+    with stop_request() as stop:
         if stop:
             return folder.name, STOPPED
         try:
@@ -57,10 +51,7 @@ def run_cell(job: Callable[[], int], folder: Path) -> tuple[str, str]:
 
 
 def continued(config: DictConfig, folder: Path) -> DictConfig | None:
-    """Return how a cell goes on with what its folder holds; None where it is done.
-
-    A folder with a run of other settings, or with one that has not ended, is refused.
-    """
+    """Return how a cell goes on with what its folder holds; None where it is done."""
     if config.resume is not None:
         raise UserError("`resume` continues one run; a sweep goes on by the same command.")
     if not (folder / "config.yaml").exists():
@@ -95,9 +86,6 @@ def _differing(first: DictConfig, second: DictConfig) -> list[str]:
     return [key for key in dict.fromkeys([*a, *b]) if repr(a.get(key)) != repr(b.get(key))][:5]
 
 
-# All of them ----------------------------------------------------------------------------------
-
-
 class CellSweeper(BasicSweeper):
     """Hydra's grid of overrides; then says which cells failed, and leaves with a status."""
 
@@ -116,9 +104,8 @@ class CellSweeper(BasicSweeper):
 
 
 def run_sweep(sweep: Callable[[], Sequence[Sequence[JobReturn]]], folder: Path, apart: bool) -> Any:
-    """Run a sweep to its end, or until Ctrl-C or SIGTERM; say what failed.
+    """Run a sweep to its end, or until Ctrl-C or SIGTERM, and leave with a status: 1, 130 or 143.
 
-    Leaves with 1 if a cell failed, with 130 or 143 if a signal stopped it, its cells saved.
     ``apart``: whether cells run in processes of their own.
     """
     file = folder.absolute() / f".stop-{os.getpid()}"
@@ -127,7 +114,7 @@ def run_sweep(sweep: Callable[[], Sequence[Sequence[JobReturn]]], folder: Path, 
         file.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"`hydra.sweep.dir` must be a folder to write to: {error}") from error
-    with StopRequest(file) as stop, _environment(file, apart=apart):
+    with stop_request(file) as stop, _environment(file, apart=apart):
         try:
             batches = sweep()
         except EXPECTED:
@@ -165,9 +152,6 @@ def _environment(stop_file: Path, *, apart: bool) -> Iterator[None]:
             del os.environ[name]
         os.environ.update(before)
         stop_file.unlink(missing_ok=True)
-
-
-# Names ----------------------------------------------------------------------------------------
 
 
 def _file_name(*parts: object) -> str:

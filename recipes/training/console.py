@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, ClassVar, Self
+from types import FrameType
+from typing import Any, ClassVar
 
 from tqdm import tqdm
 
@@ -44,39 +45,20 @@ def show(bar: tqdm[Any], row: Mapping[str, Any]) -> None:
 
 
 class StopRequest:
-    """Remember that a signal asked the run to stop, while this context is open.
+    """Whether a signal asked the run to stop, or its sweep to, which may be another process.
 
-    The first signal is remembered and nothing else happens, so that the run stops where its state
-    is whole: after the update of the current rollout. A second one ends the process as usual. One
-    inside another hands its signal on to it; a cell of a sweep also stops with its sweep, which may
-    be another process: ``file`` is made when the signal comes, for those that look for it.
+    The run then stops where its state is whole, after the update of the current rollout; a second
+    signal ends the process as usual. ``file`` is made when the signal comes, for other processes.
     """
 
-    innermost: ClassVar[StopRequest | None] = None
+    current: ClassVar[StopRequest | None] = None
 
-    def __init__(self, file: Path | None = None) -> None:
+    def __init__(self, file: Path | None) -> None:
         self.file = file
         self.signal: int | None = None
-        self._outer: StopRequest | None = None
         self._sweep = os.environ.get(STOP_FILE)
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Self:
-        """Take over both signals."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._remember)
-        self._outer, StopRequest.innermost = StopRequest.innermost, self
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Give both signals back."""
-        self._restore()
-        StopRequest.innermost = self._outer
+        signals = (signal.SIGINT, signal.SIGTERM)
+        self._before: dict[int, Any] = {n: signal.signal(n, self._remember) for n in signals}
 
     def __bool__(self) -> bool:
         """Return whether a stop was asked for."""
@@ -87,19 +69,30 @@ class StopRequest:
         """Return the shell's status for the signal: 130 for Ctrl-C, 143 for SIGTERM, else 0."""
         if self.signal is not None:
             return 128 + self.signal
-        if self._outer is not None:
-            return self._outer.exit_code
         return 128 + signal.SIGTERM if self._sweep and os.path.exists(self._sweep) else 0
 
+    def restore(self) -> None:
+        """Give both signals back."""
+        while self._before:
+            signal.signal(*self._before.popitem())
+
     def _remember(self, number: int, frame: FrameType | None) -> None:
+        del frame
         self.signal = number
-        self._restore()
+        self.restore()
         if self.file is not None:
             self.file.touch()
-        if self._outer is not None:
-            self._outer._remember(number, frame)
 
-    def _restore(self) -> None:
-        while self._before:
-            number, handler = self._before.popitem()
-            signal.signal(number, handler)
+
+@contextmanager
+def stop_request(file: Path | None = None) -> Iterator[StopRequest]:
+    """Watch for signals while this context is open; inside another one it is the same request."""
+    if StopRequest.current is not None:
+        yield StopRequest.current
+        return
+    StopRequest.current = request = StopRequest(file)
+    try:
+        yield request
+    finally:
+        request.restore()
+        StopRequest.current = None
