@@ -33,8 +33,7 @@ class MemoryAttention(nn.Module):
 
     with a learned r_j in the place of Transformer-XL's projected sinusoids. With r = 0 it is what
     ``nn.MultiheadAttention`` computes, in another order: W_k is applied to the query and W_v to the
-    average, so that no entry is projected again. A bias of the keys would shift all scores alike
-    and one of the values add to e: there is neither.
+    average, so that no entry is projected again.
     """
 
     def __init__(self, width: int, heads: int, window: int) -> None:
@@ -59,26 +58,14 @@ class MemoryAttention(nn.Module):
         ``entries``: k - 1 remembered ones, then the steps, ``(rows, k - 1 + time, width)``;
         ``visible``: whether an entry is of the episode of a step, ``(rows, time, k - 1 + time)``.
         """
-        rows, time, count = visible.shape
-        heads, head_dim, width = self.split
-        query = self.query(entries[:, -time:]).reshape(rows * time, heads, head_dim)
-        query = torch.bmm(query.transpose(0, 1), self.key.weight.view(self.split))
-        query = query.view(heads, rows, time, width).transpose(0, 1)
-        query = query.reshape(rows, heads * time, width)
-        bias = nn.functional.linear(query, self.position).view(rows, heads, time, -1)
-        bias = torch.where(visible.unsqueeze(1), shifted(bias), float("-inf"))
-        scale = head_dim**-0.5
-        scores = torch.baddbmm(
-            bias.view(rows, heads * time, count),
-            query,
-            entries.transpose(1, 2),
-            beta=scale,
-            alpha=scale,
-        )
-        mean = torch.bmm(scores.softmax(-1), entries).view(rows, heads, time, width)
-        mean = mean.transpose(0, 1).reshape(heads, rows * time, width)
-        value = torch.bmm(mean, self.value.weight.view(self.split).transpose(1, 2))
-        out: Tensor = self.out(value.transpose(0, 1).reshape(rows, time, width))
+        time, (heads, head_dim, _) = visible.shape[1], self.split
+        query = self.query(entries[:, -time:]).unflatten(-1, (heads, head_dim))
+        query = torch.einsum("rthd,hdw->rhtw", query, self.key.weight.view(self.split))
+        scores = query @ entries.unsqueeze(1).mT + shifted(query @ self.position.T)
+        scores = scores.where(visible.unsqueeze(1), -torch.inf) * head_dim**-0.5
+        mean = scores.softmax(-1) @ entries.unsqueeze(1)
+        value = torch.einsum("rhtw,hdw->rthd", mean, self.value.weight.view(self.split))
+        out: Tensor = self.out(value.flatten(-2))
         return out
 
 
@@ -125,14 +112,12 @@ class TransformerBelief(TensorDictModuleBase):
 
     A causal transformer with a memory, as Transformer-XL [Dai et al. 2019] and, for reinforcement
     learning, GTrXL [Parisotto et al. 2020]: a step passes through the layers once, and each layer
-    attends over the step and its own inputs at the k - 1 steps before it in the same episode. With
-    several layers the features so depend on the last ``layers * (k - 1) + 1`` steps.
+    attends over the step and its own inputs at the k - 1 steps before it in the same episode.
 
-    The recurrent state is the memory: normalised inputs of every layer, half of what keys and
-    values would take, and what the current weights make keys and values of. No gradient flows into
-    it. A step seen alone and the same step seen in a sequence give the same features, however the
-    rollout was cut, as long as the parameters stay. The features are the output of the last layer;
-    the auxiliary task is that of the recurrent networks.
+    The recurrent state is the memory: normalised inputs of every layer, of which the current
+    weights make keys and values. No gradient flows into it. A step seen alone and the same step
+    seen in a sequence give the same features, as long as the parameters stay. The auxiliary task is
+    that of the recurrent networks.
     """
 
     def __init__(
@@ -186,9 +171,8 @@ class TransformerBelief(TensorDictModuleBase):
         token = torch.cat([observation, seen, tensordict.get("previous_action")], -1)
         is_init = tensordict.get("is_init")
         batch = token.shape[:-1]
-        rows, time = batch.numel(), 1
-        if recurrent_mode():
-            rows, time = batch[:-1].numel(), batch[-1]
+        time = batch[-1] if recurrent_mode() else 1
+        rows = batch.numel() // time
         x = self.embed(token.reshape(rows, time, token.shape[-1]))
         is_init = is_init.reshape(rows, time)
 
@@ -220,17 +204,14 @@ class TransformerBelief(TensorDictModuleBase):
         )
         first = []
         for key, zero in zip(_STATE, zeros, strict=True):
-            value = tensordict.get(key, None)
-            first.append(
-                zero if value is None else value.reshape(rows, time, *zero.shape[1:])[:, 0]
-            )
+            value = tensordict.get(key, zero.unsqueeze(1).expand(-1, time, *zero.shape[1:]))
+            first.append(value.reshape(rows, time, *zero.shape[1:])[:, 0])
         return first[0], first[1], first[2]
 
     def _attend(self, x: Tensor, memory: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
         """Return features (rows, time, width) and the memory after each step.
 
-        ``memory`` is that before the first, ``(rows, layers, k - 1, width)``; ``start`` where the
-        episode of each step began, ``(rows, time)``.
+        ``start`` is where the episode of each step began, ``(rows, time)``.
         """
         # The entries by the step they belong to; which are outside the window the layers know.
         entry = torch.arange(1 - self.window, x.shape[1], device=x.device)
@@ -247,10 +228,8 @@ class TransformerBelief(TensorDictModuleBase):
 def build(*, obs_dim: int, action_dim: int, **settings: Any) -> Belief:
     """Build a transformer memory; the settings are those of :class:`TransformerBelief`."""
     module = TransformerBelief(obs_dim, action_dim, **settings)
-    return Belief(
-        module,
-        module.width,
-        observing=lambda: with_prediction(
-            module, module.prediction_head, _HIDDEN, lambda hidden: hidden
-        ),
-    )
+
+    def observing() -> TensorDictModuleBase:
+        return with_prediction(module, module.prediction_head, _HIDDEN, lambda hidden: hidden)
+
+    return Belief(module, module.width, observing=observing)
