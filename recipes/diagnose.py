@@ -105,12 +105,8 @@ def _diagnoses(
             )
         spike_std = float(config["spike_std"])
         for condition in parse_conditions(config["points"], trained.settings, spike_std=spike_std):
-            removed = removed_sensors(
-                condition,
-                trained,
-                episodes=config["episodes"],
-                reduction_seed=config["reduction_seed"],
-            )
+            drawn = {name: config[name] for name in ("episodes", "reduction_seed")}
+            removed = removed_sensors(condition, trained, **drawn)
             try:
                 tally = diagnose(trained, condition, removed, **options)
             except BeliefDivergedError as error:

@@ -12,7 +12,8 @@ import importlib.util
 import logging
 import os
 import shutil
-import time
+import statistics
+import timeit
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -90,8 +91,7 @@ def record(
 ) -> tuple[TensorDictBase, TensorSpec]:
     """Let an agent act by its mean action where it was trained, episode after episode.
 
-    Returns:
-        the steps, of batch size ``(robots, steps)``, and the actions that the environment takes.
+    Returns the steps, ``(robots, steps)``, and the actions that the environment takes.
     """
     with closing(make_env(trained.settings, num_envs=robots, seed=seed)) as env:
         add_primers(env, trained.agent)
@@ -132,15 +132,9 @@ def write(kind: str, step: PolicyStep, inputs: tuple[Tensor, ...], path: Path) -
             torch.export.save(program, path)
         elif kind == "onnx":
             logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-            torch.onnx.export(
-                program,
-                (),
-                path,
-                input_names=INPUTS[: len(inputs)],
-                output_names=OUTPUTS[: len(inputs) - 1],
-                external_data=False,
-                verbose=False,
-            )
+            names: Any = {"input_names": INPUTS[: len(inputs)]}
+            names |= {"output_names": OUTPUTS[: len(inputs) - 1]}
+            torch.onnx.export(program, (), path, external_data=False, verbose=False, **names)
         else:
             logging.getLogger("torch._inductor").setLevel(logging.ERROR)
             torch._inductor.aoti_compile_and_package(
@@ -171,8 +165,7 @@ def compare(
 ) -> tuple[float, float]:
     """Return by how much actions differ from recorded ones, at most, and the largest action.
 
-    What did not arrive is NaN and said to be observed; the state and the previous action are those
-    that the file itself returned.
+    The state and the previous action are those that the file itself returned.
     """
     state, action, everything = inputs[4:], torch.zeros_like(inputs[2]), torch.ones_like(inputs[1])
     found = []
@@ -188,12 +181,8 @@ def compare(
 
 def latency(call: Callable[[], Any], calls: int) -> float:
     """Return the median time of a call, microseconds, after a tenth as many to warm up."""
-    times = []
-    for _ in range(calls + calls // 10):
-        begin = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - begin)
-    return 1e6 * float(torch.tensor(times[calls // 10 :]).median())
+    times = timeit.repeat(call, number=1, repeat=calls + calls // 10)
+    return 1e6 * statistics.median(times[calls // 10 :])
 
 
 def _described(value: Tensor) -> str:

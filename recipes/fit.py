@@ -16,16 +16,7 @@ from typing import Any
 import matplotlib as mpl
 import pandas as pd
 import torch
-from estimation.fitting import (
-    INTERVALS,
-    Estimate,
-    Sequences,
-    estimates,
-    fit,
-    hide,
-    rows,
-    split,
-)
+from estimation.fitting import INTERVALS, Estimate, Sequences, estimates, fit, hide, rows, split
 from estimation.logs import read_log
 from evaluation.folders import override
 from matplotlib.figure import Figure
@@ -73,13 +64,8 @@ def run(config: dict[str, Any]) -> int:
     train, validation, test = split(len(log.episodes), config["hold_out"], config["seed"])
     norm = MaskedObservationNorm(len(log.names))
     known = torch.unique(torch.cat([train, validation]))
-    norm.update(
-        TensorDict(
-            observation=log.observation[known],
-            observed=log.observed[known],
-            batch_size=log.reset[known].shape,
-        )
-    )
+    episodes = {"observation": log.observation[known], "observed": log.observed[known]}
+    norm.update(TensorDict(episodes, batch_size=log.reset[known].shape))
     if (norm.count < 2).any():
         name = log.names[int(norm.count.argmin())]
         raise UserError(f"column `{name}` has no readings outside the held-out episodes.")
@@ -133,15 +119,8 @@ def _fitted(
 ) -> BeliefFilter:
     sizes = {"obs_dim": data.observation.shape[-1], "action_dim": data.previous_action.shape[-1]}
     belief_filter: BeliefFilter = build("belief", dict(settings), **sizes).module.filter
-    history = list(
-        fit(
-            belief_filter,
-            data.rows(train),
-            data.rows(validation),
-            length=config["sequence_length"],
-            **{key: config[key] for key in _TRAINING},
-        )
-    )
+    how = {key: config[key] for key in _TRAINING} | {"length": config["sequence_length"]}
+    history = list(fit(belief_filter, data.rows(train), data.rows(validation), **how))
     say(
         f"{name}: {max(history):.3f} nats an entry on validation episodes, epoch "
         f"{history.index(max(history)) + 1} of {len(history)}"

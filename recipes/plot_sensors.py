@@ -66,11 +66,10 @@ def title(trained: TrainedAgent) -> str:
 
 
 def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, Any]]:
-    """Return one row a criterion and place.
+    """Return one row a criterion and place; noise is in running standard deviations.
 
     ``information``: nats that the sensors up to this place hold on the state; ``variance_left``:
-    the share of tr H P H' that they leave; ``learned_noise_std`` and ``added_noise_std``: the
-    sensor's noise by R, and the one that was added, in running standard deviations of the sensor.
+    the share of tr H P H' that they leave.
     """
     criteria: tuple[Literal["D", "A"], ...] = ("D", "A")
     learned_std = model.emission_cov.diagonal().sqrt().tolist()

@@ -1,9 +1,8 @@
 """Report finished runs: ``python recipes/report.py 'run=runs/robust/*' out=results/robust``.
 
-Writes what was measured (``runs.csv``, ``training.csv``, ``evaluation.csv``), and from these tables
-alone ``summary.csv``, ``aggregate.csv``, ``comparison.csv``, figures and ``README.md``;
-``python recipes/report.py from=results/robust`` makes the latter again, ``'from=results/*'`` of
-every study. ``notes.md`` in that folder, written by hand, is put below the heading.
+Writes what was measured (runs.csv, training.csv, evaluation.csv), and from these alone further
+tables, figures and README.md; ``from=results/robust`` makes the latter again, ``'from=results/*'``
+of every study. notes.md in that folder, written by hand, is put below the heading.
 """
 
 from __future__ import annotations

@@ -26,10 +26,8 @@ class ACKTR:
 
     The policy descends ``-E[advantage log p(action)]`` in the metric of its own Fisher matrix; the
     value descends its squared error, in the metric of a Gaussian of unit standard deviation around
-    it (Gauss-Newton). The step size of the policy follows the divergence ``desired_kl``, nats a
-    rollout, that its last step should have made. ``policy`` and ``critic`` are arguments of
-    :class:`~algorithms.kfac.KFAC`, and of the critic the ``steps`` of a rollout. What PPO needs
-    (``loss``, ``steps``, ``gae``) is not used.
+    it (Gauss-Newton). The step size of the policy follows ``desired_kl``, nats a rollout; ``loss``,
+    ``steps`` and ``gae`` are PPO's.
     """
 
     def __init__(
@@ -106,17 +104,14 @@ class ACKTR:
         with torch.no_grad():
             kl = kl_divergence(dist, actor.get_dist(inputs.copy())).mean().item()
         lr = self.policy.param_groups[0]["lr"]
-        self._set_lr(_adapted(lr, kl, self.desired_kl))
+        for group in self.policy.param_groups:
+            group["lr"] = _adapted(lr, kl, self.desired_kl)
         return {
             "loss_objective": loss.item(),
             "kl": kl,
             "grad_norm": torch.stack(norms).norm().item(),
             "lr": lr,
         }
-
-    def _set_lr(self, lr: float) -> None:
-        for group in self.policy.param_groups:
-            group["lr"] = lr
 
     def state_dict(self) -> dict[str, Any]:
         """Return curvatures, momenta, step sizes, and the generator's state."""

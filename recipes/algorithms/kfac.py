@@ -1,11 +1,7 @@
 """Natural-gradient steps with Kronecker-factored curvature inside a trust region.
 
-Written here, since no library has these steps. Tried with torch 2.13: curvlinops 3.0.1 gives the
-Kronecker factors of one data set under a mean squared error, without their running average, a
-learned standard deviation or a step, and asks for six further packages; singd 0.0.5 estimates
-the curvature from the gradients of the loss itself (the empirical Fisher matrix); nngeometry 0.4
-has no running average and no step; kfac-pytorch is not on PyPI, and the asdl there is another
-package.
+No library has these steps: curvlinops and nngeometry have no running average and no step, singd
+estimates the curvature from the gradients of the loss itself.
 
 [K-FAC] J. Martens and R. Grosse, Optimizing Neural Networks with Kronecker-factored Approximate
 Curvature, ICML 2015. [ACKTR] Y. Wu et al., Scalable trust-region method for deep reinforcement
@@ -25,17 +21,10 @@ from torch import Tensor, nn
 def kronecker_factors(inputs: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
     """Return the two factors of the Fisher matrix of a linear layer.
 
-    ``F ~ A (x) G`` with ``A = E[a a']``, ``G = E[g g']`` ([K-FAC], section 3): ``a`` is the input
-    of the layer with a 1 appended for its bias, ``g`` the gradient of the log-density of a target
-    *drawn from the model*, with respect to the layer's output. The Fisher matrix of the layer is
-    ``E[a a' (x) g g']``, so the product is exact where ``a`` and ``g`` are independent.
-
-    Args:
-        inputs: of the layer, shape ``(samples, in)``.
-        scores: ``g`` of each sample, shape ``(samples, out)``.
-
-    Returns:
-        ``A`` of shape ``(in + 1, in + 1)`` and ``G`` of shape ``(out, out)``.
+    ``F ~ A (x) G`` with ``A = E[a a']``, ``G = E[g g']`` ([K-FAC], section 3): ``a`` is an input
+    ``(samples, in)`` of the layer with a 1 appended for its bias, ``g`` the score
+    ``(samples, out)``, the gradient of the log-density of a target *drawn from the model*, with
+    respect to the layer's output. The product is exact where ``a`` and ``g`` are independent.
     """
     extended = torch.cat([inputs, inputs.new_ones(inputs.shape[0], 1)], -1)
     count = inputs.shape[0]
@@ -43,16 +32,10 @@ def kronecker_factors(inputs: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def solve_kronecker(gradient: Tensor, a: Tensor, g: Tensor, damping: float) -> Tensor:
-    """Return ``(A (x) G + damping I)^-1`` times a gradient.
+    """Return ``(A (x) G + damping I)^-1`` times a gradient, shape ``(out, in + 1)``.
 
     With ``A = U diag(e) U'`` and ``G = V diag(f) V'`` the product has the eigenvalues ``f_i e_j``
     ([K-FAC], section 4.2), so that the damping is that of the whole matrix, not of its factors.
-
-    Args:
-        gradient: of weight and bias side by side, shape ``(out, in + 1)``.
-        a: factor of the inputs, shape ``(in + 1, in + 1)``.
-        g: factor of the scores, shape ``(out, out)``.
-        damping: added to every eigenvalue; positive.
     """
     e, u = torch.linalg.eigh(a)
     f, v = torch.linalg.eigh(g)
@@ -70,19 +53,9 @@ class KFAC(torch.optim.Optimizer):
     h'u)))`` holds it to ``max_kl`` ([ACKTR], section 3.3). Steps are averaged by momentum:
     ``v <- momentum v + s u``, ``parameter <- parameter - lr (1 - momentum) v``.
 
-    Args:
-        module: whose ``nn.Linear`` layers, all with a bias, are stepped.
-        lr: step size.
-        momentum: of the steps, in [0, 1).
-        damping: added to the Fisher matrix.
-        decay: of the running averages of the factors, in [0, 1); their start from 0 is corrected.
-        max_kl: largest divergence that the quadratic model may predict for one step, nats.
-        constant_fisher: further parameters, with the Fisher information of each of their
-            components, which depends on nothing: 2 for the log of a standard deviation.
-
-    Raises:
-        ValueError: if a number makes no sense, or a parameter of the module belongs to no such
-            layer.
+    All of ``module`` must be ``nn.Linear`` layers with a bias, and parameters in
+    ``constant_fisher`` with the Fisher information of their components: 2 for the log of a standard
+    deviation. ``decay`` is that of the running averages of the factors.
 
     Example:
         >>> _ = torch.manual_seed(0)
@@ -173,7 +146,10 @@ class KFAC(torch.optim.Optimizer):
         del closure
         moves, product = [], torch.zeros(())
         for group in self.param_groups:
-            gradient = _side_by_side([p.grad for p in group["params"]])
+            gradients = [p.grad for p in group["params"]]
+            if len(gradients) == 2:  # of a weight and its bias
+                gradients = [torch.cat([gradients[0], gradients[1].unsqueeze(-1)], -1)]
+            gradient = gradients[0]
             move = self._natural(group, gradient)
             moves.append(move)
             product = product + (gradient * move).sum() * group["lr"] ** 2 / 2
@@ -183,12 +159,9 @@ class KFAC(torch.optim.Optimizer):
             velocity = state.setdefault("velocity", torch.zeros_like(move))
             velocity.mul_(group["momentum"]).add_(move * scale)
             change = velocity * (-group["lr"] * (1 - group["momentum"]))
-            if group["fisher"] is not None:
-                group["params"][0].add_(change)
-            else:
-                weight, bias = group["params"]
-                weight.add_(change[:, :-1])
-                bias.add_(change[:, -1])
+            parts = [change] if len(group["params"]) == 1 else [change[:, :-1], change[:, -1]]
+            for parameter, part in zip(group["params"], parts, strict=True):
+                parameter.add_(part)
         return product * scale**2
 
     def _natural(self, group: dict[str, Any], gradient: Tensor) -> Tensor:
@@ -201,11 +174,3 @@ class KFAC(torch.optim.Optimizer):
         # The averages began at 0, as Adam's do.
         weight = 1 - self.decay ** state["observations"]
         return solve_kronecker(gradient, state["a"] / weight, state["g"] / weight, self.damping)
-
-
-def _side_by_side(gradients: list[Tensor]) -> Tensor:
-    """Return the gradient of a weight and its bias as one matrix; a lone one as it is."""
-    if len(gradients) == 1:
-        return gradients[0]
-    weight, bias = gradients
-    return torch.cat([weight, bias.unsqueeze(-1)], -1)

@@ -1,10 +1,9 @@
 """How precise and how well calibrated a trained agent's belief is, episode by episode.
 
-Two clocks run for every sensor. An entry that arrives is compared with the forecast made before it
-arrived; an entry that does not is compared with what complete, noiseless sensors would have shown.
-Both are sorted by the steps since that sensor was last seen before this step: 1 where it was seen
-the step before, 2 after one step without, and so on; "never" where it was not seen yet in this
-episode. All numbers are in normalised units, one being a running standard deviation of the sensor.
+Entries that arrive are compared with the forecast made before; those that do not with what
+complete, noiseless sensors would have shown. Both are sorted by the steps since that sensor was
+last seen: 1 where it was seen the step before, "never" where it was not seen yet in this episode.
+All numbers are in normalised units, one being a running standard deviation of the sensor.
 """
 
 from __future__ import annotations
@@ -44,39 +43,27 @@ Sums = dict[str, Tensor]
 
 
 class Compared(NamedTuple):
-    """What is compared with what.
+    """What is compared with what."""
 
-    Attributes:
-        estimate: ``filtered`` (after this step's observation), ``predicted`` (before it), ...
-        noise: whether its variance holds that of the sensor noise; None: it is a point.
-        target: ``reading``, the noisy one that arrived, or ``truth``, the noiseless one.
-        entries: those that ``arrived`` at this step, or those ``missing``.
-    """
-
-    estimate: str
-    noise: bool | None
-    target: str
-    entries: str
+    estimate: str  # "filtered" (after this step's observation), "predicted" (before it), ...
+    noise: bool | None  # whether its variance holds that of the sensor noise; None: a point
+    target: str  # "reading", the noisy one that arrived, or "truth", the noiseless one
+    entries: str  # those that "arrived" at this step, or those "missing"
 
 
 @dataclass
 class Tally:
     """Sums over the steps of each episode.
 
-    Attributes:
-        classes: names of the classes of steps since last seen; the last is ``never``.
-        lengths: steps of each episode, shape ``(episodes,)``.
-        observed: entries that arrived, shape ``(episodes,)``.
-        components: sensors.
-        sums: of each pair, of shape ``(episodes, classes)`` unless said otherwise: ``count``,
-            ``squared`` error, of Gaussians also scores such as ``crps``, ``nis`` of each class by
-            itself, ``nis_joint`` of all entries of a step together, ``(episodes, 1)``, and
-            ``under``, how many values lay under each of `LEVELS`, ``(episodes, levels)``.
+    ``sums`` are, of each pair, ``(episodes, classes)`` unless said otherwise: ``count``,
+    ``squared`` error, of Gaussians also scores such as ``crps``, ``nis`` of each class by itself,
+    ``nis_joint`` of all entries of a step together, ``(episodes, 1)``, and ``under``, how many lay
+    under each of `LEVELS`, ``(episodes, levels)``.
     """
 
-    classes: list[str]
-    lengths: Tensor
-    observed: Tensor
+    classes: list[str]  # of steps since last seen; the last is "never"
+    lengths: Tensor  # steps of each episode
+    observed: Tensor  # entries that arrived in each
     components: int
     sums: dict[Compared, Sums] = field(default_factory=dict)
 
@@ -86,10 +73,7 @@ class Tally:
         return 1 - (self.observed.sum() / (self.lengths.sum() * self.components)).item()
 
     def add(self, rows: slice, steps: Mapping[str, Tensor]) -> None:
-        """Add the steps of some episodes to the sums, by names such as ``observed`` and ``class``.
-
-        Each is of shape ``(episodes of the rows, time, obs[, obs])``.
-        """
+        """Add steps of some episodes, each entry ``(episodes of the rows, time, obs[, obs])``."""
         running = steps["running"]
         masks = {ARRIVED: steps["observed"] & running, MISSING: ~steps["observed"] & running}
         for estimate in [e for e in (FILTERED, PREDICTED, LAST_VALUE, MEAN) if e in steps]:
@@ -176,8 +160,7 @@ def diagnose(
     """Let a trained agent act and compare its belief with the readings and the truth.
 
     An agent whose belief has no estimate of the sensors has sums of the last value and the running
-    mean. ``bins`` are where the classes of steps since last seen begin; for the others see
-    :func:`evaluation.episodes.run_episodes` and :func:`evaluation.conditions.removed_sensors`.
+    mean. ``bins`` are where the classes of steps since last seen begin.
     """
     obs = trained.obs_dim
     tally = Tally(class_names(bins), torch.zeros(episodes), torch.zeros(episodes), obs)
@@ -251,17 +234,13 @@ def pool(tallies: Sequence[Tally]) -> Tally:
 
 
 def gaussian_crps(value: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    r"""Score by the continuous ranked probability score, the integral of (F(y) - [x <= y])^2.
-
-    .. math:: \sigma \left( z (2 \Phi(z) - 1) + 2 \varphi(z) - \pi^{-1/2} \right)
+    """Score by the continuous ranked probability score, in units of ``value``; 0 is perfect.
 
     Eq. (21) of Gneiting and Raftery, *Strictly Proper Scoring Rules, Prediction, and Estimation*,
-    JASA 102, 2007, with the sign turned: smaller is better, 0 is perfect. In units of ``value``; a
-    ``std`` of 0 leaves the absolute error.
+    JASA 102, 2007, with the sign turned.
     """
     error = value - mean
     z = error / std.clamp_min(torch.finfo(std.dtype).tiny)
     density = torch.exp(-0.5 * z.square()) / math.sqrt(2 * math.pi)
-    # error * (2 Phi - 1) rather than std * z * (...): std 0 leaves |error|.
-    spread = error * (2 * torch.special.ndtr(z) - 1)
+    spread = error * (2 * torch.special.ndtr(z) - 1)  # a std of 0 leaves |error|
     return spread + std * (2 * density - 1 / math.sqrt(math.pi))

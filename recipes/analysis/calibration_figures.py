@@ -1,4 +1,4 @@
-"""Figures of a diagnosis, drawn from its tables: precision, outages, reliability."""
+"""Figures of a diagnosis, drawn from its tables; None where there is nothing to draw."""
 
 from __future__ import annotations
 
@@ -26,10 +26,7 @@ _Draw = Callable[[Any, pd.DataFrame, str, str, int], None]
 
 
 def precision_figure(table: pd.DataFrame) -> Figure | None:
-    """Draw precision.csv: the error of every estimate over the steps since last seen.
-
-    One column a task and one row a point; None where there is nothing to draw.
-    """
+    """Draw precision.csv: the error of every estimate over the steps since last seen."""
     rows = table[(table["steps_since_seen"] != "all") & (table["count"] >= _FEWEST)]
 
     def draw(axis: Any, own: pd.DataFrame, label: str, colour: str, _: int) -> None:
@@ -43,10 +40,7 @@ def precision_figure(table: pd.DataFrame) -> Figure | None:
 
 
 def outage_figure(table: pd.DataFrame) -> Figure | None:
-    """Draw calibration.csv: forecasts of what arrives, by the steps since it was last seen.
-
-    A row a task and point: NIS over entries, coverage and CRPS; None where nothing is forecast.
-    """
+    """Draw calibration.csv: forecasts of what arrives, by the steps since it was last seen."""
     wanted = (table["held_against"] == "reading") & (table["steps_since_seen"] != "all")
     rows = table[wanted & (table["count"] >= _FEWEST)]
     cells = [[own] * len(_STATISTICS) for _, own in rows.groupby(["task", "point"], sort=False)]
@@ -62,7 +56,7 @@ def outage_figure(table: pd.DataFrame) -> Figure | None:
 
 
 def reliability_figure(table: pd.DataFrame) -> Figure | None:
-    """Draw reliability.csv: how often values lay under their quantiles; None without a spread."""
+    """Draw reliability.csv: how often values lay under their quantiles."""
     arrived = (table["held_against"] == "reading") & (table["entries"] == "arrived")
     missing = (table["held_against"] == "truth") & (table["entries"] == "missing")
     missing &= (table["sensor_noise"] == "out") | (table["estimate"] == "predicted")

@@ -37,10 +37,9 @@ class Resampling:
         denominator: Tensor,
         then: Callable[[Any], Any] = float,
     ) -> Row:
-        """Return a ratio of sums over episodes and its 95 % interval: ``name``, its low and high.
+        """Return a ratio of sums over episodes and the ends of its 95 % interval.
 
-        ``then`` is monotonous, applied to all three. Without a numerator all are None; the ends
-        also where fewer than two episodes count.
+        ``then`` is monotonous, applied to all three; None is what is not known.
         """
         value = low = high = None
         if numerator is not None and denominator.sum() > 0:
@@ -55,10 +54,7 @@ class Resampling:
 
 
 def precision_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[Row]:
-    """Yield the rows of precision.csv: how far estimates are from the noiseless truth.
-
-    Steps since last seen are 0 for entries that arrived.
-    """
+    """Yield the rows of precision.csv: how far estimates are from the noiseless truth."""
     resampling = Resampling(len(tally.lengths), resamples, seed)
     for pair, sums in tally.sums.items():
         for name, own in _classes(tally, sums) if pair.noise is None else ():
@@ -91,9 +87,8 @@ def calibration_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[Row
                 "claimed_std": math.sqrt(own["variance"].sum() / total),
             }
             for level in COVERAGE:
-                row |= resampling.ratio(
-                    f"coverage_{100 * level:g}", own[f"inside_{level:g}"], count
-                )
+                inside = own[f"inside_{level:g}"]
+                row |= resampling.ratio(f"coverage_{100 * level:g}", inside, count)
             row |= resampling.ratio("crps", own["crps"], count)
             row["log_score"] = own["log_score"].sum().item() / total
             row |= resampling.ratio("nis_per_dof", nis, count)

@@ -31,10 +31,10 @@ _TITLES = {"mcar": "MCAR", "mar": "MAR", "nmar": "NMAR"}
 
 
 def learning_curves(training: pd.DataFrame) -> Figure | None:
-    """Draw training return over environment steps, one panel a task.
+    """Draw training return over environment steps, one panel a task; None without episodes.
 
     Interquartile mean over seeds and its 95 % interval; on complete, exact observations also the
-    paper's threshold. None where no episode has ended.
+    paper's threshold.
     """
     training = training.assign(label=_labels(training)).dropna(subset="return")
     panels = list(training.groupby("task"))
@@ -113,9 +113,9 @@ def _points(axis: Any, points: pd.DataFrame, colour: str, label: str, *, nominal
 def episode_summary(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum up the table of recipes/evaluate.py, one row an episode, for :func:`robustness`.
 
-    Rows by agent, point and kind of action: the mean return and its 95 % bootstrap interval, over
-    runs where there are several, else over the episodes of the one. Runs that share method, task
-    and training seed are distinguished by their names.
+    The mean return and its 95 % bootstrap interval are over runs where there are several, else over
+    the episodes of the one. Runs that share method, task and training seed are distinguished by
+    their names.
     """
     # The noise of the condition stands in its name.
     episodes = episodes.drop(columns="noise_sigma", errors="ignore")
@@ -140,10 +140,7 @@ def episode_summary(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw_evaluation(episodes: pd.DataFrame) -> dict[str, Figure]:
-    """Draw the table of recipes/evaluate.py: by task a figure, a row of panels a kind of action.
-
-    A task without two levels of anything has none.
-    """
+    """Draw the table of recipes/evaluate.py: by task a figure, a row of panels a kind of action."""
     drawn = {
         str(task): robustness(rows, rows="mode", columns="kind")
         for task, rows in episode_summary(episodes).groupby("task")

@@ -52,10 +52,7 @@ def page(
     notes: str,
     folder: str,
 ) -> str:
-    """Return the page in Markdown.
-
-    Figures are the names of PNG files beside the page; notes are put below the heading as they are.
-    """
+    """Return the page in Markdown; ``figures`` are names of PNG files beside it."""
     summary, runs = tables["summary"], study.runs
     parts = [f"# {title}", notes.strip()]
     parts += [

@@ -32,9 +32,8 @@ def random_orders(count: int, sensors: int, seed: int) -> torch.Tensor:
 def ranking_figure(groups: Groups, *, orders: int, seed: int) -> Figure:
     """Draw how much is known after k sensors, and in which order they are chosen.
 
-    A column a title of ``groups``, the beliefs of the training seeds of one task: information and
-    variance left beside a band of so many random ``orders``, and the sensors by their mean place in
-    the D-optimal order.
+    A column a title of ``groups``: information and variance left beside a band of so many random
+    ``orders``, and the sensors by their mean place in the D-optimal order.
     """
     sensors = max(len(models[0].names) for models in groups.values())
     heights = [_CURVE_INCHES, _CURVE_INCHES, _SENSOR_INCHES * sensors + 0.6]
@@ -53,10 +52,7 @@ def ranking_figure(groups: Groups, *, orders: int, seed: int) -> Figure:
 
 
 def covariance_figure(groups: Groups, *, correlation: bool) -> Figure:
-    """Draw H P H' + R as heat maps, correlations beside the covariances if asked for.
-
-    A line a title of ``groups``, in it a map a training seed.
-    """
+    """Draw H P H' + R as heat maps: a line a title of ``groups``, in it a map a training seed."""
     most = max(len(models) for models in groups.values())
     kinds = ("covariance", "correlation") if correlation else ("covariance",)
     columns = most * len(kinds)

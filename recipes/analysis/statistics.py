@@ -1,6 +1,6 @@
 """Interquartile means, bootstrap intervals and probabilities of improvement (Agarwal et al. 2021).
 
-A sample is the runs of one task: runs are resampled within their task.
+A sample is the runs of one task, along its last axis: runs are resampled within their task.
 """
 
 from __future__ import annotations
@@ -9,10 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import bootstrap, mannwhitneyu, trim_mean
-
-Array = NDArray[np.float64]
 
 
 def interquartile_mean(*samples: Any, axis: int = -1) -> Any:
@@ -26,9 +23,9 @@ def ratio(first: Any, second: Any, axis: int = -1) -> Any:
 
 
 def probability_of_improvement(*pairs: Any, axis: int = -1) -> Any:
-    """Return how often a run of one method beats one of another; mean over tasks, ties are halves.
+    """Return how often a run of one method beats one of another, of pairs of samples, one a task.
 
-    ``pairs``: of each task the sample of the one method, then that of the other.
+    The mean over tasks; ties are halves.
     """
     tasks = zip(pairs[::2], pairs[1::2], strict=True)
     wins = [
@@ -38,20 +35,11 @@ def probability_of_improvement(*pairs: Any, axis: int = -1) -> Any:
 
 
 def interval(*samples: Any, statistic: Callable[..., Any] = interquartile_mean) -> tuple[Any, Any]:
-    """Return the 95 % percentile bootstrap interval of a statistic, the same at every call.
-
-    Runs are along the last axis; the ends are NaN where a sample has one run only.
-    """
+    """Return the 95 % percentile bootstrap interval of a statistic; NaN if a sample has one run."""
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
     if min(array.shape[-1] for array in arrays) < 2:
         nothing = np.full(arrays[0].shape[:-1], np.nan)[()]
         return nothing, nothing
-    ends = bootstrap(
-        arrays,
-        statistic,
-        n_resamples=5000,
-        method="percentile",
-        axis=-1,
-        rng=np.random.default_rng(0),
-    ).confidence_interval
+    how: Any = {"n_resamples": 5000, "method": "percentile", "rng": np.random.default_rng(0)}
+    ends = bootstrap(arrays, statistic, axis=-1, **how).confidence_interval
     return ends.low, ends.high

@@ -22,10 +22,7 @@ _KINDS = (
 
 
 def point_kind(point: str) -> tuple[str, float]:
-    """Return what points have in common that differ in one number, and that number.
-
-    ``mcar:0.5`` gives ``("mcar", 0.5)``, ``outages:0.5:20:sensor`` ``("outages 0.5 sensor", 20)``.
-    """
+    """Split a point such as ``outages:0.5:20:sensor`` into its kind and level: the 20 steps."""
     family, *words = point.split(":")
     level = words.pop(1 if family == "outages" and len(words) > 1 else 0) if words else "0"
     return " ".join([family, *words]), float(level)
@@ -43,22 +40,17 @@ def point_order(points: pd.Series) -> pd.Series:
 
 
 def last_evaluations(study: Study) -> pd.DataFrame:
-    """Return the evaluations of each run's last frames, one a point and kind of action.
-
-    Those of recipes/evaluate.py take precedence over the run's own.
-    """
+    """Return the evaluations of each run's last frames; those of evaluate.py take precedence."""
     found = study.evaluation.merge(study.runs[[*RUN, "frames"]], on=[*RUN, "frames"])
     found = found[found.source != "training"].sort_values("source", ascending=False, kind="stable")
     return found.drop_duplicates([*RUN, "point", "mode"])
 
 
 def summarise(study: Study) -> pd.DataFrame:
-    """Return means over the seeds of a study.
+    """Return means over the seeds of each group, by point and kind of action.
 
-    Rows for each group, point (``training``: the last 100 training episodes) and kind of action:
-    interquartile mean and ends of its 95 % interval, the share of the return with nothing missing
-    (a ratio of interquartile means), means of the other columns, and every seed's own return. A
-    group in which a seed has no number has no row at a point, and no mean of its training.
+    ``share``: of the return with nothing missing, a ratio of interquartile means. A group in which
+    a seed has no number has no row at a point, and no mean of its training.
     """
     training = study.runs.rename(columns={"return": "return_mean"})
     rows = pd.concat([training.assign(point=TRAINING, mode="sampled"), last_evaluations(study)])
@@ -108,8 +100,7 @@ def family(tasks: Any) -> Any:
 def aggregate(rows: pd.DataFrame) -> pd.DataFrame:
     """Return interquartile means over all runs of all tasks, as shares of the paper's thresholds.
 
-    Rows where two tasks or more with a positive threshold were evaluated; a method that lacks one
-    of them has none.
+    Of two tasks or more with a positive threshold, by methods that were evaluated on all of them.
     """
     rows = rows.assign(score=rows.return_mean / family(rows.task).map(THRESHOLDS))
     rows = rows[family(rows.task).map(THRESHOLDS) > 0]
@@ -129,10 +120,9 @@ def aggregate(rows: pd.DataFrame) -> pd.DataFrame:
 def compare(study: Study, rows: pd.DataFrame, reference: str) -> pd.DataFrame:
     """Compare a method with every other where half of all entries may be missing.
 
-    Rows, of the last evaluations: ratio of interquartile means less one with its 95 % interval
-    (none where the other has a return that is not positive); the probability that a run of the
-    reference beats one of the other; environment steps of both. Where these differ, a further row
-    compares their training returns at equal steps. Task ``all tasks``: the mean probability.
+    ``margin`` is a ratio of interquartile means less one, none where the other has a return that is
+    not positive. Where the two have unequal steps, a further row compares their training returns at
+    equal ones. Task ``all tasks``: the mean probability.
     """
     rows = rows[[point_kind(p)[0] in _HALF and point_kind(p)[1] == 0.5 for p in rows.point]]
     rows = pd.concat([rows, _at_equal_steps(study, reference)])

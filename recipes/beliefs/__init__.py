@@ -41,8 +41,7 @@ class Belief:
             over time under ``set_recurrent_mode(True)``.
         feature_dim: components of ``features``.
         summary: numbers worth a column in metrics.csv, asked for once a rollout.
-        observing: makes a module with the weights of ``module`` that also writes what the belief
-            knows of the sensors (see the top of this file); None where it knows nothing.
+        observing: see the top of this file; None where the belief knows nothing of the sensors.
         after_rollout: called with a rollout once its epochs are over, and with the first one, from
             which statistics are taken: for what is learned otherwise than by gradients.
         pretrained: file of weights that a new run starts from, or None.

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
+from torch import Tensor
 
 from beliefs import (
     ESTIMATE,
@@ -30,37 +30,25 @@ from torchrl_drbpn.functional.robust import Robust
 _READ = {"observation": OBSERVATION}
 
 
-class SensorVariances(nn.Module):
-    """Turn the covariance of the state into variances of the sensors."""
-
-    def __init__(self, emission: LinearGaussianEmission) -> None:
-        super().__init__()
-        self.emission = emission
-
-    def forward(self, cov: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the diagonals of H P H' and R, ``(*, obs)``, of P, ``(*, state, state)``."""
-        H = self.emission.matrix
-        variance = ((H @ cov) * H).sum(-1)
-        return variance, self.emission.cov().diagonal().expand_as(variance)
-
-
 def observing(module: BeliefFilterModule) -> TensorDictSequential:
     """Make the filter write everything that it knows of the sensors."""
     cov = ("belief", "cov")
     wanted = ["features", ("belief", "mean"), ("belief", "log_likelihood"), cov]
     wanted += [ESTIMATE, FORECAST, FORECAST_COV]
     filtering = BeliefFilterModule(
-        module.filter,
-        in_keys=_READ,
-        policy_input=module.policy_input,
-        out_keys=wanted,
+        module.filter, in_keys=_READ, policy_input=module.policy_input, out_keys=wanted
     )
-    variances = TensorDictModule(
-        SensorVariances(module.filter.emission),
-        in_keys=[cov],
-        out_keys=[ESTIMATE_VARIANCE, NOISE_VARIANCE],
+    emission = module.filter.emission
+
+    def variances(cov: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the diagonals of H P H' and R, ``(*, obs)``, of P, ``(*, state, state)``."""
+        variance = ((emission.matrix @ cov) * emission.matrix).sum(-1)
+        return variance, emission.cov().diagonal().expand_as(variance)
+
+    written = [ESTIMATE_VARIANCE, NOISE_VARIANCE]
+    return TensorDictSequential(
+        filtering, TensorDictModule(variances, in_keys=[cov], out_keys=written)
     )
-    return TensorDictSequential(filtering, variances)
 
 
 def build(

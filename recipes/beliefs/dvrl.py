@@ -11,10 +11,7 @@ _READ = {"observation": OBSERVATION}
 
 
 def build(*, obs_dim: int, action_dim: int, **settings: Any) -> Belief:
-    """Build the particle filter; its evidence lower bound is the model loss.
-
-    The settings are those of :class:`~torchrl_drbpn.ParticleFilter`.
-    """
+    """Build the particle filter; its evidence lower bound is the model loss."""
     particle_filter = ParticleFilter(obs_dim, action_dim, **settings)
     module = ParticleFilterModule(particle_filter, in_keys=_READ)
     # The particles' mean; a mixture of Gaussians has no single covariance to be held to.

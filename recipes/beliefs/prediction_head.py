@@ -49,22 +49,6 @@ class PredictionHead(nn.Module):
         return mean, positive_std(self.raw_std, self.min_std)
 
 
-class StoredPrediction(nn.Module):
-    """Predict the next observation from a stored state, one step at a time."""
-
-    def __init__(
-        self, prediction_head: PredictionHead, hidden_of: Callable[[Tensor], Tensor]
-    ) -> None:
-        super().__init__()
-        self.prediction_head, self.hidden_of = prediction_head, hidden_of
-
-    def forward(self, state: Tensor, action: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the forecast, ``(*, obs)``, and its covariance; an episode starts from zeros."""
-        hidden = torch.where(is_init, 0.0, self.hidden_of(state))
-        mean, std = self.prediction_head.predict(hidden, action)
-        return mean, torch.diag_embed(std.square().expand_as(mean))
-
-
 def with_prediction(
     module: TensorDictModuleBase,
     prediction_head: PredictionHead,
@@ -75,9 +59,13 @@ def with_prediction(
 
     ``hidden_of`` picks the hidden state out of the recurrent one that is read at ``state_key``.
     """
-    prediction = TensorDictModule(
-        StoredPrediction(prediction_head, hidden_of),
-        in_keys=[state_key, "previous_action", "is_init"],
-        out_keys=[FORECAST, FORECAST_COV],
-    )
+
+    def predict(state: Tensor, action: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the forecast, ``(*, obs)``, and its covariance; an episode starts from zeros."""
+        hidden = torch.where(is_init, 0.0, hidden_of(state))
+        mean, std = prediction_head.predict(hidden, action)
+        return mean, torch.diag_embed(std.square().expand_as(mean))
+
+    in_keys = [state_key, "previous_action", "is_init"]
+    prediction = TensorDictModule(predict, in_keys=in_keys, out_keys=[FORECAST, FORECAST_COV])
     return TensorDictSequential(prediction, module)

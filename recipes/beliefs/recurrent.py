@@ -60,9 +60,7 @@ class RecurrentBelief(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write features, log-likelihood and the next hidden state."""
         observation = tensordict.get(OBSERVATION)
-        observed = tensordict.get("observed")
-        is_init = tensordict.get("is_init")
-        parts = [observation, observed.to(observation.dtype)]
+        parts = [observation, tensordict.get("observed").to(observation.dtype)]
         if self.with_action:
             parts.append(tensordict.get("previous_action"))
         stored = tensordict.get(_STATE, None)
@@ -73,7 +71,7 @@ class RecurrentBelief(TensorDictModuleBase):
         tensordict.set("features", features)
         for key in self.memory.out_keys[1:]:
             tensordict.set(key, data.get(key))
-        before = self._before(features, stored, is_init)
+        before = self._before(features, stored, tensordict.get("is_init"))
         tensordict.set(("belief", "log_likelihood"), self.prediction_head(before, tensordict))
         return tensordict
 

@@ -20,6 +20,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Transform, TransformedEnv
 from torchrl.modules.utils import get_primers_from_module
 from training.config import one_line
+from training.envs import COLLECTING
 from training.errors import EnvironmentFault, UserError
 
 _RECIPES = Path(__file__).parents[1]
@@ -27,22 +28,12 @@ _PATIENCE = 20  # seconds for a cluster to answer
 
 
 class RayRollouts:
-    """Collect rollouts in Ray's workers, each with its simulators and a copy of the policy.
+    """Collect rollouts in Ray's workers, see conf/collector/ray.yaml.
 
     What TorchRL's ``Collector(backend="ray")`` needs to stand in the training loop. The policy's
     parameters and buffers, statistics of normalisation among them, are sent before each rollout.
     The workers start at the first one, seeded from torch's global generator: so many workers and
     one seed make one run, and a resumed run doesn't repeat its first episodes.
-
-    Args:
-        env: of this process, which stays where it is.
-        policy: decides.
-        make_env: builds an environment, given ``num_envs`` and ``seed``.
-        num_envs: simulators of all workers together.
-        steps_per_env: environment steps of each in a rollout.
-        workers: processes.
-        cpus_per_worker: that Ray sets aside for each of them.
-        address: of a cluster, ``host:port``; ``auto``: the one that runs here; None: a new one.
     """
 
     def __init__(
@@ -112,6 +103,8 @@ class RayRollouts:
         size, seeds = self._num_envs // self._workers, torch.randint(2**62, (self._workers,))
         path = [str(_RECIPES), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
         variables = {"PYTHONPATH": os.pathsep.join(os.path.abspath(part) for part in path if part)}
+        resources = {"num_cpus": self._cpus, "scheduling_strategy": "SPREAD"}
+        resources["runtime_env"] = {"env_vars": variables}
         self._collector = Collector(
             [partial(_worker_env, self._make_env, size, int(seed), primers) for seed in seeds],
             self._policy,
@@ -119,18 +112,7 @@ class RayRollouts:
             sync=True,
             frames_per_batch=self._num_envs * self._steps,
             total_frames=math.inf,
-            backend_options={
-                "collector_kwargs": {
-                    "track_traj_ids": False,
-                    "use_buffers": True,
-                    "auto_register_policy_transforms": False,
-                },
-                "remote_configs": {
-                    "num_cpus": self._cpus,
-                    "scheduling_strategy": "SPREAD",
-                    "runtime_env": {"env_vars": variables},
-                },
-            },
+            backend_options={"collector_kwargs": COLLECTING, "remote_configs": resources},
         )
         self._rollouts = iter(self._collector)
 

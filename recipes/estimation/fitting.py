@@ -57,9 +57,13 @@ def split(episodes: int, share: float, seed: int) -> tuple[Tensor, Tensor, Tenso
 
 def run(belief_filter: BeliefFilter, data: Sequences, before: Belief | None = None) -> FilterOutput:
     """Filter sequences, from their own first step or from beliefs before it."""
+    return belief_filter(*(before or _zero_belief(belief_filter, data)), *data, return_cov=True)
+
+
+def _zero_belief(belief_filter: BeliefFilter, data: Sequences) -> Belief:
+    """Return the beliefs before a first step, where they are of no account."""
     zero = data.observation.new_zeros(len(data.reset), belief_filter.state_dim)
-    start = before or Belief(zero, torch.diag_embed(zero))
-    return belief_filter(*start, *data, return_cov=True)
+    return Belief(zero, torch.diag_embed(zero))
 
 
 def per_entry(out: FilterOutput, data: Sequences) -> Tensor:
@@ -85,7 +89,7 @@ def fit(
 
     Windows start from the beliefs that the filter had there at the start of the epoch. The actions
     are scaled while training, and the scale is folded into the weights behind it. The weights of
-    the best epoch stay; the last ``patience`` epochs without a better one are the end.
+    the best epoch stay.
     """
     scale = train.previous_action.square().mean((0, 1)).sqrt()
     scale = torch.where(scale > 0, scale, 1.0)
@@ -96,16 +100,11 @@ def fit(
     useful = windows.observed.flatten(1).any(1).nonzero().squeeze(1)
     generator = torch.Generator().manual_seed(seed)
     groups: list[dict[str, Any]] = [
-        {
-            "params": [
-                p
-                for name, p in belief_filter.named_parameters()
-                if (name.startswith("transition") and name.endswith("weight")) is decayed
-            ],
-            "weight_decay": weight_decay * decayed,
-        }
-        for decayed in (True, False)
+        {"params": [], "weight_decay": decay} for decay in (weight_decay, 0.0)
     ]
+    for name, parameter in belief_filter.named_parameters():
+        decayed = name.startswith("transition") and name.endswith("weight")
+        groups[0 if decayed else 1]["params"].append(parameter)
     optimizer = torch.optim.AdamW(groups, lr, eps=1e-5)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 1e-2, total_iters=steps)
     best, kept, done, waited = -torch.inf, copy.deepcopy(belief_filter.state_dict()), 0, 0
@@ -152,7 +151,6 @@ def _starts(belief_filter: BeliefFilter, data: Sequences, length: int) -> Belief
     return Belief(mean, cov)
 
 
-# ---------------------------------------------------------------------------------- comparison
 def hide(observed: Tensor, share: float, mean_length: float, seed: int) -> Tensor:
     """Return which entries to hide: outages of each sensor, mean length in steps."""
     rates, generator = outage_rates(share, mean_length), torch.Generator().manual_seed(seed)
@@ -174,8 +172,7 @@ def estimates(filters: dict[str, BeliefFilter], data: Sequences) -> dict[str, Es
         likelihood = per_entry(out, data).item()
         found[name] = _readings(belief_filter, filtered, data, likelihood)
     first, belief_filter = next(iter(filters.items()))
-    start = torch.zeros(len(data.reset), belief_filter.state_dim)
-    smoothed = belief_filter.smooth(start, torch.diag_embed(start), *data)
+    smoothed = belief_filter.smooth(*_zero_belief(belief_filter, data), *data)
     found[f"{first}, smoothed"] = _readings(belief_filter, smoothed, data, None)
     step = torch.arange(data.reset.shape[1]).view(1, -1, 1).expand_as(data.observation)
     last = torch.where(data.observed, step, -1).cummax(1).values

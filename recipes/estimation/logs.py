@@ -13,19 +13,14 @@ from torch import Tensor
 from training.config import nearest
 from training.errors import UserError
 
-_READERS = {".csv": "read_csv", ".parquet": "read_parquet"}
+_READERS = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
 
 
 class Log(NamedTuple):
     """Episodes side by side, each from its first row; steps behind the end of one are resets.
 
-    Args:
-        observation: shape ``(episodes, time, obs)``, 0 where missing; float64.
-        observed: bool of that shape.
-        previous_action: ``(episodes, time, action)``, 0 at the first step; float32.
-        reset: bool, ``(episodes, time)``.
-        names: of the components of an observation.
-        episodes: their names.
+    Shapes are ``(episodes, time[, obs or action])``; a missing reading is 0, and so is the action
+    before the first step. ``names`` are those of the components of an observation.
     """
 
     observation: Tensor
@@ -39,46 +34,30 @@ class Log(NamedTuple):
 def read_log(
     path: str | None, observation: Sequence[str], action: Sequence[str], episode: str | None
 ) -> Log:
-    """Read columns of a log.
+    """Read columns of a CSV, Parquet or NPZ file, see conf/fit.yaml.
 
     An action belongs to the row in which it was taken and leads to the next row. A log without
     actions has one that is always 0.
-
-    Args:
-        path: CSV, Parquet or NPZ; of NPZ an array of shape (rows, k) is the k columns ``name[0]``,
-            ..., and its name means all of them.
-        observation: names of columns.
-        action: names of columns.
-        episode: name of the column that tells episodes apart.
-
-    Raises:
-        UserError: for a file, a column or a cell that can't be used.
     """
     table = _read_table(path)
     there = f"there are {', '.join(map(str, table.columns))}"
     if episode is None:
         raise UserError(f"`episode` must name the column that tells episodes apart; {there}.")
-    seen, moves = (
-        _columns(table, key, names)
-        for key, names in (("observation", observation), ("action", action))
-    )
+    seen, moves = _columns(table, "observation", observation), _columns(table, "action", action)
     (column,) = _columns(table, "episode", [episode])
     if not seen:
-        raise UserError(
-            f"`observation` must name columns; there are {', '.join(map(str, table.columns))}."
-        )
+        raise UserError(f"`observation` must name columns; {there}.")
     everything = [*seen, *moves, column]
     if twice := [name for name in dict.fromkeys(everything) if everything.count(name) > 1]:
         raise UserError(f"column `{twice[0]}` is named twice: as observation, action or episode.")
     values, actions = _numbers(table, seen), _numbers(table, moves)
-    for name, readings in zip(seen, values.T, strict=True):
-        readings = readings[~np.isnan(readings)]
-        if not len(readings):
+    for name, readings in pd.DataFrame(values, columns=seen).items():
+        if not readings.count():
             raise UserError(f"`observation`: column `{name}` has no reading at all; leave it out.")
-        if np.ptp(readings) == 0:
+        if readings.nunique() == 1:
             raise UserError(
-                f"`observation`: column `{name}` is constant at {readings[0]:g}: there is nothing "
-                "to learn; leave it out."
+                f"`observation`: column `{name}` is constant at {readings.max():g}: there is "
+                "nothing to learn; leave it out."
             )
     if (empty := table[column].isna()).any():
         raise UserError(f"`episode`: column `{column}` is empty in row {empty.argmax() + 1}.")
@@ -117,15 +96,12 @@ def _read_table(path: str | None) -> pd.DataFrame:
         raise UserError(f"`data` must be .csv, .parquet or .npz, got {path}.")
     try:
         if suffix != ".npz":
-            return getattr(pd, _READERS[suffix])(path)
-        with np.load(path, allow_pickle=False) as arrays:
-            columns = {name: arrays[name] for name in arrays.files}
+            return _READERS[suffix](path)
         flat: dict[str, Any] = {}
-        for name, array in columns.items():
-            if array.ndim == 2:
-                flat |= {f"{name}[{i}]": column for i, column in enumerate(array.T)}
-            else:
-                flat[name] = array
+        with np.load(path, allow_pickle=False) as arrays:
+            for name, array in arrays.items():
+                parts = enumerate(array.T) if array.ndim == 2 else ()
+                flat |= {f"{name}[{i}]": part for i, part in parts} or {name: array}
         return pd.DataFrame(flat)
     except ImportError as error:
         raise UserError("`data`: Parquet needs pyarrow: pip install pyarrow.") from error

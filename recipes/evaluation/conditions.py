@@ -28,11 +28,9 @@ _MECHANISMS = ("none", "mcar", "mar", "nmar")
 
 @dataclass(frozen=True)
 class Condition:
-    """What an agent is evaluated under; what it does not name stays as in training.
+    """What an agent is evaluated under; ``name`` reads back to the same condition.
 
-    ``name`` reads back to the same condition; ``family`` is its part before the first colon. A
-    ``ratio`` of the sensors is taken away for good, by ``selection``: model, random, or empty
-    (none).
+    A ``ratio`` of the sensors is taken away for good, by ``selection``: model, random, or "".
     """
 
     name: str
@@ -65,8 +63,7 @@ class Condition:
 def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Condition:
     """Read a condition such as ``mcar:0.5``, see conf/evaluate.yaml.
 
-    What the text does not name stays as in ``settings``, the configuration of the run;
-    ``spike_std`` is the deviation of spikes where the text gives none, raw units.
+    What the text does not name stays as in ``settings``, the configuration of the run.
     """
     missing, noise = settings.missingness, settings.noise
     if text == "trained":
@@ -97,20 +94,15 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
         for key in {"always_observed", "mechanism_seed"} & {*missing} & {*trained}:
             missing[key] = trained[key]
         name = missingness_name(missing)
-    _check(text, settings, missing, noise)
-    taken = values if family == "reduction" else {}
-    return Condition(name, family, missing, noise, **taken)
-
-
-def _check(text: str, settings: DictConfig, missingness: DictConfig, noise: DictConfig) -> None:
-    """Let the transforms of a condition say what they refuse before any episode."""
     changed = settings.copy()
-    changed.missingness, changed.noise = missingness, noise
-    try:
+    changed.missingness, changed.noise = missing, noise
+    try:  # the transforms say what they refuse before any episode
         for group in ("missingness", "noise"):
             build(group, changed[group])
     except UserError as error:
         raise UserError(f"`points` must hold other numbers than {text!r}: {error}") from error
+    taken = values if family == "reduction" else {}
+    return Condition(name, family, missing, noise, **taken)
 
 
 def parse_conditions(
@@ -126,16 +118,15 @@ def default_conditions(
 ) -> list[str]:
     """Return the conditions of an evaluation that names none, as text.
 
-    ``levels`` is ``grid`` of conf/evaluate.yaml (ratio 0, the same in every family, counts once),
-    ``full`` whether to go beyond MCAR, MAR and sensor reduction, ``model`` whether the agent has a
-    model that can choose sensors.
+    ``levels`` is ``grid`` of conf/evaluate.yaml; ``model``: whether the agent has a model that can
+    choose sensors.
     """
     ratios = [ratio for ratio in levels["ratios"] if ratio > 0]
-    out = ["none:0"] if len(ratios) < len(levels["ratios"]) else []
-    out += [f"{f}:{r:g}" for f in ("mcar", "mar", "nmar")[: 3 if full else 2] for r in ratios]
-    out += [
-        f"reduction:{r:g}:{by}" for by in ("model", "random")[0 if model else 1 :] for r in ratios
-    ]
+    out = ["none:0"] if len(ratios) < len(levels["ratios"]) else []  # the same in every family
+    mechanisms = ("mcar", "mar", "nmar") if full else ("mcar", "mar")
+    out += [f"{mechanism}:{ratio:g}" for mechanism in mechanisms for ratio in ratios]
+    selections = ("model", "random") if model else ("random",)
+    out += [f"reduction:{ratio:g}:{by}" for by in selections for ratio in ratios]
     if full:
         out += [
             f"outages:{ratio:g}:{length:g}:{by}"
@@ -156,10 +147,9 @@ def removed_sensors(
 ) -> Tensor | None:
     """Return the sensors that a condition takes away for good, ``(episodes, obs)``; None: none.
 
-    At random, every episode lacks sensors of its own: a mean over episodes is one over choices too.
-    The order in which an episode loses sensors is drawn from ``reduction_seed`` and its number
-    alone, so that every agent of a task meets the same choices, and those of a smaller ratio are
-    among those of a larger one. By the agent's model, one choice holds for every episode.
+    At random, every episode lacks sensors of its own. The order in which an episode loses sensors
+    is drawn from ``reduction_seed`` and its number alone, so that every agent of a task meets the
+    same choices, and those of a smaller ratio are among those of a larger one.
     """
     if not condition.selection:
         return None

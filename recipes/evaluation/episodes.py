@@ -42,9 +42,8 @@ def evaluate(
 ) -> pd.DataFrame | None:
     """Run episodes, see :func:`run_episodes`, one row each; None if they were given up.
 
-    ``return`` sums raw rewards; ``missing_ratio`` is the share of entries that did not arrive;
-    ``log_likelihood`` nats per observed entry, normalised units, NaN without a model or where the
-    belief ``diverged``: where it left the range of its numbers and the robot was stopped.
+    ``log_likelihood``: nats per observed entry, normalised units, NaN without a model or where the
+    belief ``diverged``, see `StoppingPolicy`.
     """
     names = ("return", "length", "entries", "arrived", "nats", "diverged")
     sums = torch.zeros(len(names), episodes, dtype=torch.float64)
@@ -58,8 +57,8 @@ def evaluate(
         for total, value in zip(sums, step, strict=True):
             total[rows] += running * value
 
-    how: Any = {"episodes": episodes, "mode": mode, "seed": seed}
-    if not run_episodes(policy, make_env, **how, watch=add, stop=stop):
+    how: Any = {"episodes": episodes, "mode": mode, "seed": seed, "watch": add, "stop": stop}
+    if not run_episodes(policy, make_env, **how):
         return None
     table = pd.DataFrame(dict(zip(names, sums.numpy(), strict=True)))
     diverged = table.diverged > 0
@@ -73,17 +72,12 @@ def evaluate(
 
 
 def over_episodes(episodes: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
-    """Sum up rows of :func:`evaluate` by some of their columns.
-
-    Missing ratio and log-likelihood are over all steps and entries; the latter is 0 where nothing
-    arrived, and NaN where a belief diverged.
-    """
+    """Sum up rows of :func:`evaluate` by some of their columns, over all steps and entries."""
     arrived = episodes.length * (1 - episodes.missing_ratio)
     nats = arrived * episodes.get("log_likelihood", np.nan)
-    table = episodes.assign(
-        arrived=arrived, nats=nats, diverged=episodes.get("diverged", 0.0)
-    ).groupby(list(by), sort=False, as_index=False)
-    rows = table.agg(
+    diverged = episodes.get("diverged", 0.0)
+    table = episodes.assign(arrived=arrived, nats=nats, diverged=diverged)
+    rows = table.groupby(list(by), sort=False, as_index=False).agg(
         episodes=("return", "size"),
         return_mean=("return", "mean"),
         return_std=("return", "std"),
@@ -110,16 +104,11 @@ def run_episodes(
     watch: Watch,
     stop: Callable[[], bool] = lambda: False,
 ) -> bool:
-    """Run episodes to their ends, and show every step of them.
-
-    The global generator is left as it was found. The belief of an episode that is over begins anew
-    at every step: its row is not simulated, the policy sees its last observation again and again,
-    and a belief that went on with that could leave the range of its numbers.
+    """Run episodes to their ends; False if ``stop``, asked at every step, gave them up.
 
     ``make_env`` builds the environment of the block of a number, batch size ``(BLOCK,)``. ``watch``
     is called after every step with the episodes of the block, the stepped tensordict of these, and
-    whether each was still running before the step. ``stop`` is asked at every step: where it
-    returns True the episodes are given up, and False comes back.
+    whether each was still running before the step. The global generator is left as it was found.
     """
     with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(_KINDS[mode]):
         for block, first in enumerate(range(0, episodes, BLOCK)):
@@ -143,7 +132,11 @@ def run_episodes(
 
 
 def _leave_standing(root: TensorDictBase, running: Tensor) -> TensorDictBase:
-    """Let the beliefs of episodes that are over begin anew, in place."""
+    """Let the beliefs of episodes that are over begin anew, in place.
+
+    The policy sees the last observation of these again and again: a belief that went on with that
+    could leave the range of its numbers.
+    """
     if not running.all():
         root.set("is_init", root.get("is_init") | ~running)
         carried = root.get("recurrent", None)
@@ -158,10 +151,9 @@ def _only_rows(rows: Tensor, value: Tensor) -> Tensor:
 
 
 class StoppingPolicy(TensorDictModuleBase):
-    """Act as ``agent.policy``; where the belief has diverged, with zero actions to the end.
+    """Act as ``agent.policy``; where the belief has ``diverged``, with zero actions to the end.
 
-    Without its sensors a learned transition runs open loop and need not be stable. In training that
-    is an error; under test it is a result: ``diverged`` marks it, and the other episodes go on.
+    Without its sensors a learned transition runs open loop and need not be stable.
     """
 
     def __init__(self, agent: Agent) -> None:

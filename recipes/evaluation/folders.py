@@ -12,14 +12,10 @@ from training.errors import UserError
 
 
 def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
-    """Return run folders, each once, sorted, by their names or patterns.
-
-    A folder that exists is no pattern, whatever its name holds. A pattern gives the folders with a
-    config.yaml.
-    """
+    """Return run folders, each once, sorted, by their names or patterns (with a config.yaml)."""
     found: list[Path] = []
     for text in [wanted] if isinstance(wanted, str) else wanted or []:
-        if Path(text).is_dir():
+        if Path(text).is_dir():  # no pattern, whatever its name holds
             found.append(Path(text))
         elif glob.has_magic(text):
             matches = [Path(path) for path in glob.glob(text, recursive=True)]
@@ -39,10 +35,7 @@ def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
 
 
 def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
-    """Leave out runs before their first checkpoint, with a line.
-
-    If none has one, all are returned: reading the first says what is wrong.
-    """
+    """Leave out runs before their first checkpoint, unless none has one: reading says it then."""
     kinds = ("checkpoints/*.pt", "*.safetensors")
     found = [folder for folder in folders if any(any(folder.glob(kind)) for kind in kinds)]
     for folder in folders if found else ():

@@ -26,8 +26,7 @@ def _one_of(*words: str) -> Callable[[str], str]:
 _SHARE, _GROUP_BY = _number(most=1.0), ("group_by", _one_of(*GROUPINGS), "sensor")
 # Of each family what follows its name: a key of conf, how it is read, and what it is where the text
 # ends before; without that it must be there. None and False end the text.
-_Field = tuple[str, Callable[[str], Any]] | tuple[str, Callable[[str], Any], Any]
-FIELDS: dict[str, tuple[_Field, ...]] = {
+FIELDS: dict[str, tuple[tuple[Any, ...], ...]] = {
     **dict.fromkeys(("none", "mcar", "mar", "nmar"), (("eta", _SHARE),)),
     "outages": (("eta", _SHARE), ("mean_length", _number()), _GROUP_BY),
     "delay": (
@@ -54,7 +53,7 @@ def read_fields(family: str, words: list[str]) -> dict[str, Any] | None:
     fields = FIELDS.get(family, ())
     try:
         given = {field[0]: field[1](word) for field, word in zip(fields, words, strict=False)}
-        rest = {field[0]: field[2] for field in fields[len(words) :]}  # type: ignore[misc]
+        rest = {field[0]: field[2] for field in fields[len(words) :]}
     except (ValueError, IndexError):
         return None
     return given | rest if fields and len(words) <= len(fields) else None

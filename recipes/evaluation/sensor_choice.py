@@ -23,11 +23,10 @@ from torchrl_drbpn import BeliefFilterModule, select_sensors
 
 @dataclass(frozen=True)
 class SensorModel:
-    """What a trained belief has learned about its sensors, float64.
+    """What a trained belief has learned about its sensors: H, P = Q and R, float64.
 
-    H ``(obs, state)``, P = Q ``(state, state)``, R ``(obs, obs)``. ``added_std``: deviations of the
-    noise that the sensors did have in training, spikes included, in the units of R's; R should hold
-    it, and what the model can't explain.
+    ``added_std``: deviations of the noise that the sensors did have in training, spikes included,
+    in the units of R's; R should hold it, and what the model can't explain.
     """
 
     names: list[str]
@@ -44,11 +43,7 @@ class SensorModel:
         return H @ self.predicted_cov @ H.mT + self.emission_cov
 
     def ranking(self, criterion: Literal["D", "A"]) -> Tensor:
-        """Return all sensors, best first, by information ("D") or by the variance left ("A").
-
-        The latter is that of what the sensors would read without noise, tr H P+ H', which no choice
-        of the state's units changes.
-        """
+        """Return all sensors, best first, by information ("D") or by the tr H P+ H' left ("A")."""
         H, P, R = self.emission_matrix, self.predicted_cov, self.emission_cov
         target = H if criterion == "A" else None
         return select_sensors(H, P, R, len(self.names), criterion=criterion, target=target).indices

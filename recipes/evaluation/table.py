@@ -1,8 +1,4 @@
-"""The table of an evaluation: whole conditions, written whole after each.
-
-A condition of a run is the unit: its episodes are in the table whole or not at all, so that an
-evaluation killed at any moment goes on where it was.
-"""
+"""The table of an evaluation, which goes on where it was killed: it holds whole conditions."""
 
 from __future__ import annotations
 
@@ -45,8 +41,7 @@ class Protocol:
 class Table:
     """One row an episode, as text; what the file holds is kept unless ``overwrite`` begins anew.
 
-    A file of another kind, of other settings, or of another agent or checkpoint than ``agents``, by
-    the names of their run folders, is refused.
+    ``agents`` are by the names of their run folders: a table of another one is refused.
     """
 
     def __init__(
@@ -88,11 +83,7 @@ class Table:
         self.write()
 
     def arrange(self, order: Sequence[tuple[str, str]]) -> None:
-        """Put runs and conditions into an order, whatever the one in which they came.
-
-        Others that the table holds come first, as they are. Of a condition, sampled actions come
-        before mean ones.
-        """
+        """Put runs and conditions into an order, others first, sampled actions before mean ones."""
         keys = self.rows["run"] + "\n" + self.rows["point"]
         ranks = {f"{run}\n{point}": rank for rank, (run, point) in enumerate(order)}
         rank, first = keys.map(ranks).fillna(-1), pd.factorize(keys)[0]

@@ -82,10 +82,10 @@ class TrainedAgent:
         *,
         complete: bool = False,
     ) -> Callable[[int], TransformedEnv]:
-        """Return what builds the environment of a block of episodes, like the training ones.
+        """Return what builds the environment of a block of episodes.
 
         What is None stays as in training; ``removed``, bool of shape ``(episodes, obs)``, never
-        arrives. ``complete``: whether to write ``complete_observation``, normalised alike.
+        arrives. ``complete``: whether to write ``complete_observation``.
         """
         changed = self.settings.copy()
         changed.missingness = missingness or changed.missingness
@@ -94,16 +94,11 @@ class TrainedAgent:
         def make(block: int) -> TransformedEnv:
             replaced = {}
             if removed is not None:
-                own = removed[block * BLOCK : (block + 1) * BLOCK]
-                rest = removed.new_zeros(BLOCK - len(own), self.obs_dim)
-                replaced["reduction"] = SensorReduction(torch.cat([own, rest]))
-            env = make_env(
-                changed,
-                num_envs=BLOCK,
-                seed=changed.evaluation.seed,
-                complete=complete,
-                transforms=replaced,
-            )
+                here = removed[block * BLOCK : (block + 1) * BLOCK]
+                rest = removed.new_zeros(BLOCK - len(here), self.obs_dim)
+                replaced["reduction"] = SensorReduction(torch.cat([here, rest]))
+            own: Any = {"num_envs": BLOCK, "seed": changed.evaluation.seed}
+            env = make_env(changed, **own, complete=complete, transforms=replaced)
             add_primers(env, self.agent)
             return env
 
@@ -115,10 +110,8 @@ def load_trained_agent(
 ) -> TrainedAgent:
     """Read the last checkpoint of a run, or an agent that recipes/save_agent.py saved.
 
-    Args:
-        folder: of either.
-        robust: "huber", "imq" or "none", the update that it acts with; None: as in training.
-        threshold: where its weights begin to fall, standard deviations.
+    ``robust``: "huber", "imq" or "none", the update that it acts with; None: as in training.
+    ``threshold``: where its weights begin to fall, standard deviations.
     """
     config, weights = load_config(folder), folder / WEIGHTS
     with closing(make_env(config, num_envs=1)) as env:
@@ -167,11 +160,7 @@ def _load_weights(path: Path, agent: Agent) -> int:
 def evaluate_training(
     config: DictConfig, training: Training, kind: str, episodes: int, stop: Callable[[], bool]
 ) -> list[dict[str, Any]] | None:
-    """Evaluate the agent of a run as it is now; nothing of the training changes.
-
-    Returns a row for each kind of action, or None where ``stop``, asked at every step, gave the
-    evaluation up.
-    """
+    """Evaluate the agent of a run: a row for each kind of action, None if ``stop`` ended it."""
     make_env = TrainedAgent(config, training.agent, training.frames).environments()
     how: Any = {"episodes": episodes, "seed": config.evaluation.seed, "stop": stop}
     rows = []

@@ -21,10 +21,7 @@ _WIDTH_INCHES, _PANEL_INCHES, _STRIP_INCHES, _MASK_INCHES = 10.0, 1.05, 1.55, 0.
 
 
 def chosen_sensors(recording: Recording, wanted: int | str | Sequence[int | str]) -> list[int]:
-    """Return the indices of the sensors to draw.
-
-    ``wanted`` is how many of those that miss most, or names or numbers of components.
-    """
+    """Return the sensors to draw: ``wanted`` of those that miss most, or by names or numbers."""
     names = recording.names
     if isinstance(wanted, int):
         if wanted < 1:
@@ -58,28 +55,19 @@ def draw_belief(
         draw_panels(axes, recording, sensors)
         axes[-1].set_xlim(recording.steps[0] - 0.5, recording.steps[-1] + 0.5)
         figure.supylabel("sensor value in running standard deviations", fontsize=9.5)
-        figure.legend(
-            handles=legend_of(recording), loc="outside lower center", ncols=4, frameon=False
-        )
+        place: Any = {"loc": "outside lower center", "ncols": 4, "frameon": False}
+        figure.legend(handles=legend_of(recording), **place)
     return figure
 
 
 def draw_panels(axes: Sequence[Any], recording: Recording, sensors: Sequence[int]) -> None:
-    """Draw the mask of all sensors and, of some, truth, arrivals, gaps and belief over the steps.
-
-    The first of the axes is for the mask, then comes one a sensor; they share the steps.
-    """
+    """Draw the mask of all sensors, then a panel a sensor: truth, arrivals, gaps and belief."""
     count, steps = len(recording.names), recording.steps
     edges = (steps[0] - 0.5, steps[-1] + 0.5)
-    axes[0].imshow(
-        ~recording.observed.T,
-        extent=(*edges, count, 0),
-        aspect="auto",
-        interpolation="nearest",
-        cmap=mpl.colors.ListedColormap(["white", ABSENT]),
-        vmin=0,
-        vmax=1,
-    )
+    cells: Any = {"aspect": "auto", "interpolation": "nearest"}
+    absent = mpl.colors.ListedColormap(["white", ABSENT])
+    missed = ~recording.observed.T
+    axes[0].imshow(missed, extent=(*edges, count, 0), cmap=absent, vmin=0, vmax=1, **cells)
     axes[0].set_yticks([])
     axes[0].spines[["top", "right"]].set_visible(True)
     missing = 100 * recording.missing_ratio
@@ -93,10 +81,8 @@ def draw_panels(axes: Sequence[Any], recording: Recording, sensors: Sequence[int
         known = np.concatenate([truth, arrived, mean])
         room = 0.12 * np.ptp(known[np.isfinite(known)]) + 0.05
         low, high = np.nanmin(known) - room, np.nanmax(known) + room
-        gaps = np.where(seen, np.nan, 1)[None]
-        shade: Any = {"aspect": "auto", "interpolation": "nearest", "zorder": 0}
-        shade["cmap"] = mpl.colors.ListedColormap([MISSING])
-        axis.imshow(gaps, extent=(*edges, low, high), **shade)
+        gaps, shade = np.where(seen, np.nan, 1)[None], mpl.colors.ListedColormap([MISSING])
+        axis.imshow(gaps, extent=(*edges, low, high), cmap=shade, zorder=0, **cells)
         axis.fill_between(steps, mean - half, mean + half, color=BELIEF, alpha=0.3, lw=0, zorder=2)
         axis.plot(steps, mean, color=BELIEF, lw=2.2, alpha=0.75, zorder=3)
         axis.plot(steps, truth, color=TRUTH, lw=0.9, ls=_DASHES, zorder=4)
@@ -131,11 +117,8 @@ def _draw_strip(axis: Any, recording: Recording, count: int) -> None:
     part = len(recording.steps) / count
     for index in range(count):
         left = recording.steps[0] - 0.5 + index * part
-        axis.imshow(
-            recording.pictures[int((index + 0.5) * part)],
-            extent=(left + 0.02 * part, left + 0.98 * part, 0, 1),
-            aspect="auto",
-            interpolation="lanczos",
-        )
+        place = (left + 0.02 * part, left + 0.98 * part, 0, 1)
+        picture = recording.pictures[int((index + 0.5) * part)]
+        axis.imshow(picture, extent=place, aspect="auto", interpolation="lanczos")
     axis.set_ylim(0, 1)
     axis.axis("off")

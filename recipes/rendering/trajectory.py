@@ -37,9 +37,7 @@ class Recording:
 
     ``complete`` is what complete, noiseless sensors would have shown; ``arrived`` holds 0 where
     nothing did. ``estimate`` is, by ``kind``, each sensor's value by what arrived until this step,
-    the reading predicted from the step before, or NaN; ``std`` its deviation (of the filter the
-    root of the diagonal of H P H'), or NaN. ``pictures`` of the robot are empty where it can't be
-    drawn.
+    the reading predicted from the step before, or NaN; ``std`` its deviation, or NaN.
     """
 
     kind: Kind
@@ -122,8 +120,7 @@ def record_episode(
     """Let a trained agent act and record what it saw, missed and believed.
 
     The episode is the first of an evaluation with the same seed; the ``steps`` from ``start`` on
-    are kept, fewer where it ends before. If nothing can be drawn, a printed line says why; without
-    ``picture_size`` (width and height in pixels) there are no pictures.
+    are kept. Without ``picture_size`` (width and height in pixels) there are no pictures.
     """
     # States are read from Gymnasium's simulators, whatever the agent was trained on.
     local = trained.settings.copy()
@@ -171,8 +168,9 @@ def record_episode(
     if not rows:
         raise UserError(f"`start` must lie inside the episode, which ended after {done} steps.")
     columns: Any = (torch.stack(column).numpy() for column in zip(*rows, strict=True))
-    whole = pictures if len(pictures) == len(rows) else []
-    return Recording(kind, task, trained.sensors, start, whole, *columns)
+    if len(pictures) < len(rows):  # drawing failed on the way
+        pictures = []
+    return Recording(kind, task, trained.sensors, start, pictures, *columns)
 
 
 def _sensors(data: TensorDictBase) -> tuple[Kind, tuple[Tensor, ...]]:

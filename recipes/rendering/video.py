@@ -1,9 +1,7 @@
 """The film of an agent at work: the robot, its sensors, what is missing, and the belief.
 
-TorchRL's PixelRenderTransform can't make the frames: a transform of the environment draws an
-observation before the agent has read it, and the belief of that step is not there yet. So an
-episode is recorded first and drawn afterwards. TorchRL's VideoRecorder hands its frames to a
-logger, none of which writes a GIF or takes a file's name; imageio does both.
+TorchRL's PixelRenderTransform draws an observation before the agent has read it, when the belief of
+that step is not there yet: an episode is recorded first and drawn afterwards.
 """
 
 from __future__ import annotations
@@ -50,8 +48,8 @@ def robot_size(width: int) -> tuple[int, int]:
 class Film(Sequence[Picture]):
     """Frames of an episode, each drawn when it is asked for.
 
-    The panels, of the ``sensors``, are drawn once, over the whole recording; a frame, one for each
-    index of the recording in ``steps``, shows the ``window`` of steps up to its own.
+    The panels are drawn once; a frame, one for each index of the recording in ``steps``, shows the
+    ``window`` of steps up to its own.
     """
 
     def __init__(
@@ -79,15 +77,9 @@ class Film(Sequence[Picture]):
                 axis = figure.add_axes(_ROBOT)
                 axis.axis("off")
                 self._robot = axis.imshow(recording.pictures[0], interpolation="lanczos")
-            grid = figure.add_gridspec(
-                len(sensors) + 1,
-                1,
-                left=0.43 if recording.pictures else 0.075,
-                right=0.985,
-                bottom=0.17,
-                top=0.91,
-                hspace=0.55,
-            )
+            left = 0.43 if recording.pictures else 0.075
+            edges: Any = {"left": left, "right": 0.985, "bottom": 0.17, "top": 0.91}
+            grid = figure.add_gridspec(len(sensors) + 1, 1, hspace=0.55, **edges)
             self.axes = list(grid.subplots(sharex=True, squeeze=False).ravel())
             draw_panels(self.axes, recording, sensors)
             place: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 0.0), "fontsize": 7}

@@ -1,14 +1,10 @@
 """The agent: normalisation, belief module, policy head and value head.
 
-Building one, and reading one back, takes three calls; a run's folder holds all they need::
+A run's folder holds all that it takes to build one, and to read one back::
 
-    config = load_config(folder)             # training.run_folder: what Hydra composed
-    env = make_env(config, num_envs=4)       # training.envs: simulators and corruption
-    agent = make_agent(config, env)          # here; add_primers(env, agent) makes env step it
-    agent, frames = load_agent(folder, config, env)   # the same with trained weights
-
-``agent.policy`` is a ``TensorDictSequential`` of ``agent.norm``, ``agent.belief`` and
-``agent.actor``; ``agent.observing()`` is a belief module that writes what it knows of the sensors.
+    config = load_config(folder)
+    env = make_env(config, num_envs=4)
+    agent, frames = load_agent(folder, config, env)   # add_primers(env, agent) makes env step it
 """
 
 from __future__ import annotations
@@ -51,12 +47,7 @@ class Agent(nn.Module):
     in their place: the value of a policy that acts on a belief depends on that belief, and a critic
     without it is biased [Baisero and Amato 2022].
 
-    Attributes:
-        norm: standardises observations; learns by ``norm.update(rollout)`` alone.
-        belief, actor, critic: the belief module, ``features`` to actions, and to ``state_value``.
-        policy: normalisation, belief module, policy head.
-        summary: numbers of the belief worth a column of metrics.csv.
-        observing: makes the belief module that also writes what it knows of the sensors; None.
+    ``policy`` is normalisation, belief module and policy head.
     """
 
     def __init__(
@@ -98,10 +89,8 @@ class Agent(nn.Module):
         """Return V of the beliefs that one step of the belief module makes of what is stored.
 
         A stored step holds what arrived, the action before it and the belief before it, so one
-        batched step gives every belief at once: no second pass over time. Of ``data["next"]`` it
-        gives the beliefs that follow, truncated and terminal steps included.
-
-        Of all steps, shape ``(*, 1)``, or of those of the mask ``where``, shape ``(count, 1)``.
+        batched step gives every belief at once: of all steps, shape ``(*, 1)``, or of those of the
+        mask ``where``, shape ``(count, 1)``.
         """
         keys = (*self.belief.in_keys, *self.critic.in_keys)
         read = tensordict.select(*keys, strict=False)

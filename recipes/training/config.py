@@ -47,24 +47,17 @@ _LIMITS: dict[str, tuple[float, float]] = {
 }
 
 
-# Composing ------------------------------------------------------------------------------------
-
-
-def composed_config(overrides: Sequence[str] = (), name: str = "config") -> DictConfig:
+def composed_config(overrides: Sequence[str] = ()) -> DictConfig:
     """Compose and check the configuration that a command line gives, outside a Hydra job."""
     try:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-            config = hydra.compose(name, list(overrides))
-            return checked(config, overrides) if name == "config" else config
+            return checked(hydra.compose("config", list(overrides)), overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error)) from error
 
 
 def choice(group: str, name: str, **values: Any) -> DictConfig:
-    """Return an entry of a config group, such as ``choice("missingness", "mcar", eta=0.5)``.
-
-    It may refer to other groups: put it into the configuration of a run.
-    """
+    """Return an entry of a config group, such as ``choice("missingness", "mcar", eta=0.5)``."""
     node = cast(DictConfig, OmegaConf.load(CONF / group / f"{name}.yaml"))
     for key, value in values.items():
         if key not in node:
@@ -76,8 +69,7 @@ def choice(group: str, name: str, **values: Any) -> DictConfig:
 def build(name: str, node: Any, *args: Any, **kwargs: Any) -> Any:
     """Build what a node of the configuration names; what it refuses is one line for the user.
 
-    ``name`` is the node's, for the error; arguments are the target's, beside those of the node,
-    whose own ``name`` is a label and not handed on.
+    ``name`` is for the error; the node's own ``name`` is a label and not handed to the target.
     """
     plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
     if not isinstance(plain, dict) or "_target_" not in plain:
@@ -92,14 +84,10 @@ def build(name: str, node: Any, *args: Any, **kwargs: Any) -> Any:
         raise UserError(f"`{name}`: {one_line(cause)}") from error
 
 
-# Checking -------------------------------------------------------------------------------------
-
-
 def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
     """Check types against those of the defaults, limits, and what must go together.
 
-    Whole floats in the place of integers are made integers. ``overrides`` are the words that the
-    configuration was composed from; Hydra must be initialised.
+    ``overrides`` are the words that the configuration was composed from.
     """
     groups = [word for word in overrides if (CONF / word.split("=")[0].lstrip("+~")).is_dir()]
     defaults = hydra.compose("config", groups)
@@ -148,7 +136,7 @@ def _check_sizes(config: DictConfig) -> None:
 
 
 def _check_type(config: DictConfig, key: str, value: Any, default: Any) -> None:
-    """Hold a value to the type of its default; null stands for any."""
+    """Hold a value to the type of its default, null for any; make whole floats integers."""
     if default is None or isinstance(default, (DictConfig, ListConfig)) or value is default:
         return
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
@@ -172,9 +160,8 @@ def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         for key in node:
             if OmegaConf.is_interpolation(node, str(key)):
                 continue  # checked where it comes from
-            missing = OmegaConf.is_missing(node, key)
             name = f"{path}.{key!s}" if path else str(key)
-            if missing:
+            if OmegaConf.is_missing(node, key):
                 raise UserError(f"`{name}` must be given.")
             yield from leaves(node[key], name)
     else:
@@ -185,9 +172,6 @@ def check_mode(mode: str) -> None:
     """Refuse what is not the name of a kind of action, ``sampled`` or ``mean``."""
     if mode not in ("sampled", "mean"):
         raise UserError(f"`modes` must hold sampled and mean, got {mode!r}.")
-
-
-# Names of folders -----------------------------------------------------------------------------
 
 
 def _run_folder(resume: str | None, env: str, version: str | None, belief: str, seed: int) -> str:
@@ -209,9 +193,6 @@ def new_folder(name: str) -> str:
 
 
 OmegaConf.register_new_resolver("run_folder", _run_folder, use_cache=True, replace=True)
-
-
-# The command line -----------------------------------------------------------------------------
 
 
 def run_command(main: Callable[[], None], name: str = "config") -> None:

@@ -40,6 +40,12 @@ from training.sensors import named_sensors, sensor_groups
 
 # Written by the environment on request, read by a critic on request, by a policy never.
 COMPLETE = "complete_observation"
+# How every collector collects.
+COLLECTING: dict[str, Any] = {
+    "track_traj_ids": False,
+    "use_buffers": True,
+    "auto_register_policy_transforms": False,
+}
 
 
 def make_env(
@@ -54,13 +60,9 @@ def make_env(
 
     The recurrent state's primer is not in it: :func:`training.agent.add_primers` appends it.
 
-    Args:
-        config: of the run; the simulators and the seed are its own unless given.
-        num_envs: simulators in the batch.
-        seed: of episodes and corruption.
-        transforms: by their names in ``config.transforms``, in the place of what stands there.
-        complete: whether to write ``complete_observation``, what complete, noiseless sensors would
-            have shown; None: where the critic reads it.
+    What is None is the configuration's. ``transforms`` take the place of what stands at their names
+    in ``config.transforms``; ``complete``: whether to write `COMPLETE`, what complete, noiseless
+    sensors would have shown (None: where the critic reads it).
     """
     size = {} if num_envs is None else {"num_envs": num_envs}
     base: EnvBase = build("env", config.env, **size)
@@ -192,10 +194,7 @@ def make_noise(
     id: str = "",
     version: str | None = None,
 ) -> list[Transform]:
-    """Make what is wrong with the entries that arrive: drift, noise, spikes, then what is stuck.
-
-    See conf/noise for the arguments.
-    """
+    """Make what is wrong with the entries that arrive, in this order; see conf/noise."""
     made: list[Transform] = []
     if drift_std != 0 or drift_rate != 0:
         made.append(SensorDrift(drift_std, drift_rate))
@@ -210,10 +209,7 @@ def make_noise(
 
 
 def make_outages(*, group_by: str, id: str, version: str | None, **settings: Any) -> SensorOutages:
-    """Make sensors fail for a while, alone or together, see conf/missingness/outages.yaml.
-
-    ``state_key`` is where it is kept which of them work; two in one environment need two.
-    """
+    """Make sensors fail for a while, alone or together, see conf/missingness/outages.yaml."""
     return SensorOutages(groups=_groups(id, version, group_by), **settings)
 
 
@@ -253,12 +249,5 @@ def make_collector(
     steps_per_env: int,
 ) -> Collector:
     """Make TorchRL's collector of one rollout after the other."""
-    return Collector(
-        env,
-        policy,
-        frames_per_batch=num_envs * steps_per_env,
-        total_frames=-1,
-        track_traj_ids=False,
-        use_buffers=True,
-        auto_register_policy_transforms=False,
-    )
+    frames = num_envs * steps_per_env
+    return Collector(env, policy, frames_per_batch=frames, total_frames=-1, **COLLECTING)

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import TensorDictBase
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
@@ -31,10 +30,7 @@ def make_loss(
     normalize: Literal["entry", "step"],
     detach_belief: bool,
 ) -> LossModule:
-    """Build the loss: PPO and, where the belief has a likelihood, that of what arrived.
-
-    See conf/loss/ppo.yaml. Its outputs named ``loss*`` are to be summed.
-    """
+    """Build the loss, see conf/loss/ppo.yaml; its outputs named ``loss*`` are to be summed."""
     ppo = ClipPPOLoss(
         agent.actor,
         agent.critic,
@@ -57,9 +53,6 @@ def make_loss(
         model_coeff=model_coeff,
         detach_belief=detach_belief,
     )
-
-
-# Advantages -----------------------------------------------------------------------------------
 
 
 @torch.no_grad()
@@ -86,41 +79,26 @@ def add_advantages(
     gae(data)
 
 
-# Minibatches ----------------------------------------------------------------------------------
-
-
-def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorDict:
-    """Cut a rollout with advantages into sequences and keep what the loss reads.
+def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorDictBase:
+    """Cut a rollout with advantages into sequences ``(-1, length)`` and keep what the loss reads.
 
     The last step of each environment is marked ``final``: the rollout ends there, so that the
     observation after it is nobody's root step and its likelihood is counted here. Where sequences
-    are cut from each other nothing is marked. The tensors are contiguous, batch size
-    ``(environments * time / length, length)``.
+    are cut from each other nothing is marked.
     """
     final = torch.zeros(*data.shape, 1, dtype=torch.bool)
     final[:, -1] = True
-    tensors: dict[NestedKey, torch.Tensor] = {"final": final}
-    for key in (*loss.in_keys, *_ESTIMATES):
-        value = data.get(key, None)
-        if value is not None:
-            tensors[key] = value
-    rows = data.shape[0] * data.shape[1] // length
-    out = TensorDict({}, batch_size=[rows, length])
-    for key, value in tensors.items():
-        out.set(key, value.reshape(rows, length, *value.shape[2:]).contiguous())
-    return out
+    kept = data.select(*loss.in_keys, *_ESTIMATES, strict=False).set("final", final)
+    return kept.reshape(-1, length).contiguous()
 
 
 def minibatches(
-    sequences: TensorDict, count: int, generator: torch.Generator
+    sequences: TensorDictBase, count: int, generator: torch.Generator
 ) -> Iterator[TensorDictBase]:
     """Yield the sequences in random order, each once, in so many minibatches."""
     order = torch.randperm(sequences.shape[0], generator=generator)
     # One gather an epoch; the minibatches are views of it.
     yield from sequences[order].split(sequences.shape[0] // count)
-
-
-# Steps ----------------------------------------------------------------------------------------
 
 
 class GradientSteps:
@@ -155,10 +133,7 @@ class GradientSteps:
 
 
 class PPO:
-    """Take epochs of minibatch steps on one loss over belief, policy and value.
-
-    ``gae`` recomputes advantages where that is asked for; ``seed`` orders the minibatches.
-    """
+    """Take epochs of minibatch steps, in the order of ``seed``, on one loss."""
 
     def __init__(
         self, agent: Agent, *, loss: LossModule, steps: GradientSteps, gae: GAE, seed: int
@@ -173,8 +148,7 @@ class PPO:
         """Take the gradient steps of one rollout ``(environments, time)`` with advantages.
 
         The learning rate falls with ``remaining``, the share of the run still to come. Returns the
-        means of what the loss reports, and the learning rate. A loss, gradient or weight that is no
-        finite number ends the run.
+        means of what the loss reports, and the learning rate.
         """
         lr = self.steps.lr * remaining
         for group in self.steps.optimizer.param_groups:
@@ -189,7 +163,7 @@ class PPO:
         row = {_NAMES.get(key, key): mean.item() for key, mean in means.items()}
         return {**row, "lr": lr}
 
-    def cut(self, data: TensorDictBase) -> Iterator[TensorDict]:
+    def cut(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
         """Yield the sequences of each epoch; advantages are recomputed in place."""
         sequences = to_sequences(data, self.loss, self.sequence_length)
         for epoch in range(self.steps.epochs):
@@ -230,15 +204,11 @@ def check_finite(tensors: Mapping[str, torch.Tensor], kind: str) -> None:
             raise DivergedError(f"the {kind} `{name}` is {wrong[0].item()}.")
 
 
-# Numbers to log -------------------------------------------------------------------------------
-
-
 def rollout_metrics(data: TensorDictBase) -> dict[str, float | None]:
     """Return what a rollout with advantages says of the sensors, the belief and the value.
 
-    ``missing_ratio`` is over all components; ``log_likelihood`` nats per observed entry of
-    normalised observation, None without a model; ``explained_variance`` that of the returns by the
-    values, 0 where they do not vary.
+    ``log_likelihood``: nats per observed entry, normalised, None without a model;
+    ``explained_variance``: of the returns by the values, 0 where they do not vary.
     """
     observed, target = data.get("observed"), data.get("value_target")
     likelihood = data.get(("belief", "log_likelihood"), None)
@@ -255,10 +225,7 @@ def rollout_metrics(data: TensorDictBase) -> dict[str, float | None]:
 
 
 def finished_episodes(data: TensorDictBase, frames: int) -> list[dict[str, Any]]:
-    """Return the episodes that ended in a rollout, in the order of time.
-
-    ``frames`` are the environment steps at its end; ``return`` is raw.
-    """
+    """Return the episodes that ended in a rollout, in the order of time; ``return`` is raw."""
     # Time first, so that the order does not depend on the environment's place in the batch.
     done, returns, lengths = (
         data.get(("next", key)).squeeze(-1).transpose(0, 1)

@@ -16,10 +16,9 @@ from torchrl_drbpn.functional.running_moments import (
 
 
 class ReturnStatistics(NamedTuple):
-    """Hold what is remembered from one rollout to the next; ``_asdict()`` goes into a checkpoint.
+    """Hold count, mean and variance of the discounted returns seen, float64 ``(1,)``.
 
-    Count, mean and variance of the discounted returns seen, float64 ``(1,)``, and those of the
-    episodes that go on, ``(environments, 1)``.
+    ``discounted``: the returns so far of the episodes that go on, ``(environments, 1)``.
     """
 
     n: Tensor
@@ -52,13 +51,8 @@ def scale_reward(
     scaling of [Engstrom et al. 2020, Implementation matters in deep policy gradients].
 
     Returns the scaled rewards, ``(environments, time, 1)``, and the statistics with this rollout in
-    them.
+    them. The rewards are finite: ``collect`` of ppo_drbpn.py has checked them.
     """
-    if not bool(reward.isfinite().all()):
-        raise ValueError(
-            "`reward` holds NaN or an infinity, which would scale every later reward; look at the "
-            "environment's reward."
-        )
     discounted, returns = statistics.discounted.to(reward), []
     for r, over in zip(reward.unbind(1), done.unbind(1), strict=True):
         discounted = gamma * discounted + r

@@ -29,10 +29,7 @@ def _expanded(node: Any) -> list[str]:
 
 
 def named_sensors(task: str, version: str | None) -> list[str]:
-    """Return the names of a task's sensors; none where the task has no table.
-
-    The id is ``Walker2d``, or ``Walker2d-v5`` where ``version`` is None.
-    """
+    """Return the names of a task's sensors; none where the task has no table."""
     return list(_table().get(f"{task}-{version}" if version else task, ()))
 
 
@@ -62,11 +59,10 @@ _KINDS = (
 
 
 def sensor_groups(names: Sequence[str], by: str) -> list[list[int]] | None:
-    """Return what fails together: indices in the order of their first; None for ``sensor``.
+    """Return what fails together, indices in the order of their first; None: each by itself.
 
-    ``by`` is ``sensor``: each component by itself; ``joint``: all that is measured at one joint or
-    body, such as angle and velocity; ``kind``: all positions and angles, all velocities, all
-    forces, all inertias.
+    By ``joint``: all that is measured at one joint or body, such as angle and velocity; by
+    ``kind``: all positions and angles, all velocities, all forces, all inertias.
     """
     if by == "sensor":
         return None

@@ -56,10 +56,7 @@ class Training:
     evaluated_frames: int = -1
 
     def state_dict(self, *, simulators: bool = True) -> dict[str, Any]:
-        """Return everything that a checkpoint holds, between two rollouts.
-
-        ``simulators``: whether their state is worth keeping; not where they have failed.
-        """
+        """Return everything that a checkpoint holds; ``simulators``: not those that have failed."""
         keeps = simulators and self.keeps_simulators
         return {
             "agent": self.agent.state_dict(),
@@ -80,10 +77,7 @@ class Training:
         }
 
     def load_state_dict(self, state: dict[str, Any], source: str) -> None:
-        """Put a run back to where a checkpoint of a run with the same settings was written.
-
-        ``source``: where it came from, for the error of a state that belongs to another run.
-        """
+        """Put a run back to where a checkpoint was written; ``source`` names it in errors."""
         with fitting(source):
             self.agent.load_state_dict(state["agent"])
             self.algorithm.load_state_dict(state)
