@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch, StepArrays
 
-__all__ = ["EnvPoolBatchEnv"]
-
 # Not the largest int32: EnvPool adds one to it.
 _NO_LIMIT = 2**30
 
@@ -34,12 +32,11 @@ class EnvPoolBatchEnv(SimulatorBatch):
     - EnvPool 1.2.5 carries MuJoCo 3.6, so that trajectories from equal states agree with those of
       Gymnasium on MuJoCo 4.0 closely, not exactly, and its random numbers are others: a seed gives
       other first observations. Rewards are rounded to ``float32`` inside.
-    - The seeds of EnvPool are fixed where the simulators are made. A new seed therefore makes them
-      anew at the next reset, and every row has to be reset before the next step.
+    - A new seed makes the simulators anew at the next reset, and every row has to be reset before
+      the next step.
     - A terminated row can not be stepped on: EnvPool would start the next episode.
-    - The state can not be saved: :attr:`supports_state` is False, ``state_dict()`` is empty, and
-      the caller has to start new episodes. A copy or a pickle starts new episodes too.
-    - Resets of MuJoCo by itself can not be seen: :attr:`engine_resets` stays 0.
+    - The state can not be saved: :attr:`supports_state` is False; a copy or a pickle starts new
+      episodes. Resets of MuJoCo by itself can not be seen: :attr:`engine_resets` stays 0.
 
     Examples:
         >>> env = EnvPoolBatchEnv("InvertedPendulum-v5", 3, seed=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,39 +10,36 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import flatten, flatten_space
 from gymnasium.wrappers import OrderEnforcing, TransformObservation
 from numpy.typing import NDArray
 
 from torchrl_drbpn.envs.engine_warnings import bad_state_counters, model_warnings_once
 from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch, StepArrays, one_line
-from torchrl_drbpn.envs.simulator_state import is_mujoco, load_state, save_state
-
-__all__ = ["GymnasiumBatchEnv"]
+from torchrl_drbpn.envs.simulator_state import load_state, save_state
 
 
 class GymnasiumBatchEnv(SimulatorBatch):
     r"""Step many Gymnasium environments as one TorchRL environment with batch size ``[num_envs]``.
 
     The trajectories are those of ``gymnasium.make(env_id)``, bit for bit in ``float64``: the same
-    wrappers, time limits and seeding, no change of reward or observation. There is no automatic
-    reset inside: where an episode ends, ``("next", "observation")`` holds its true last
-    observation, and TorchRL's ``step_and_maybe_reset``, ``rollout`` and collectors reset the
-    finished rows. Actions outside the Box are clipped to it before the step.
+    wrappers, time limits and seeding, no change of reward or observation. Where an episode ends,
+    ``("next", "observation")`` holds its true last observation, and TorchRL's
+    ``step_and_maybe_reset``, ``rollout`` and collectors reset the finished rows. Actions outside
+    the Box are clipped to it before the step.
 
     Seeds: ``set_seed(s)`` and ``reset(seed=s)`` give sub-environment ``i`` the ``i``-th word of
     ``numpy.random.SeedSequence(s)``, so that neighbouring seeds share no sub-environment (as
-    ``s + i`` would) and the first rows do not depend on ``num_envs``. The next reset of a row uses
-    its seed, once; later resets go on from there. ``reset(options=...)`` goes to every task's own.
+    ``s + i`` would). The next reset of a row uses its seed, once; later resets go on from there.
 
     Faults: where MuJoCo gives up its state (it resets itself after huge velocities, and drops
     controls that are NaN), the step is counted in :attr:`engine_resets`, a first one warns, and the
     episode ends as truncated. A simulator that raises, or returns a reward that is not finite,
     raises :class:`SimulatorError`.
 
-    Saving: ``state_dict()`` holds the whole state of MuJoCo environments, and a run that goes on
-    from it is the same to the last bit. Where :attr:`supports_state` is False it is empty, and the
-    caller has to start new episodes.
+    Saving: ``state_dict()`` holds the whole state of MuJoCo environments, for runs that go on from
+    it to the last bit. Where :attr:`supports_state` is False it is empty: start new episodes.
 
     Args:
         env_id: a Gymnasium id with a vector observation and a Box action, for example
@@ -53,13 +49,11 @@ class GymnasiumBatchEnv(SimulatorBatch):
     Keyword Args:
         seed: seed as in ``set_seed``. Default: None, seeds from the operating system.
         device: device of the tensors that come out. The simulators run on the CPU.
-        dtype: ``torch.float32`` or ``torch.float64``, of observations and rewards. Actions have
-            the dtype of the Gymnasium action space.
+        dtype: ``torch.float32`` or ``torch.float64``, of observations and rewards.
         max_episode_steps: steps after which an episode is truncated. Default: None, as registered;
             -1: no limit. A task's own ``TimeLimit``, in its entry point, counts in every case.
         num_threads: threads that step the environments, each its own share; the results do not
-            depend on it. MuJoCo runs outside the interpreter lock, so that a second thread pays
-            where a second core is free.
+            depend on it.
         observation_keys: entries of a dictionary observation that are joined into one vector.
         wrappers: callables that take an environment and return it wrapped, the innermost first.
         **make_kwargs: passed to ``gymnasium.make``, for example ``render_mode="rgb_array"``.
@@ -82,13 +76,10 @@ class GymnasiumBatchEnv(SimulatorBatch):
 
     def _build(self) -> tuple[Any, Any, int | None, int | None]:
         """Make the environments, without the outermost time limit, which the batch keeps."""
-        module, _, name = self.env_id.rpartition(":")
         try:
-            if module:
-                importlib.import_module(module)
-            limit = gymnasium.spec(name).max_episode_steps
             with model_warnings_once():
-                self.envs = [self._make(name) for _ in range(self.num_envs)]
+                self.envs = [self._make() for _ in range(self.num_envs)]
+            limit = gymnasium.spec(self.env_id.rpartition(":")[2]).max_episode_steps
         except (gymnasium.error.Error, ImportError) as error:
             raise ValueError(
                 f"`env_id` must be a registered Gymnasium environment, got {self.env_id!r}: "
@@ -96,20 +87,21 @@ class GymnasiumBatchEnv(SimulatorBatch):
             ) from error
         self._steps = [env.step for env in self.envs]
         self._warned = [bad_state_counters(env) for env in self.envs]
-        self._pool: ThreadPoolExecutor | None = None
-        share = -(-self.num_envs // self.num_threads)
-        starts = range(0, self.num_envs, share)
-        self._shares = [range(i, min(i + share, self.num_envs)) for i in starts]
+        shares = np.array_split(np.arange(self.num_envs), self.num_threads)
+        self._shares: list[list[int]] = [share.tolist() for share in shares]
+        self._pool = ThreadPoolExecutor(self.num_threads, "gymnasium-batch")
         env = self.envs[0]
         own = None if env.spec is None else env.spec.max_episode_steps  # a TimeLimit in the task
         return env.observation_space, env.action_space, limit, own
 
-    def _make(self, name: str) -> gymnasium.Env[Any, Any]:
+    def _make(self) -> gymnasium.Env[Any, Any]:
         wanted = dict(self.make_kwargs)
         wrappers = wanted.pop("wrappers", ())
         with warnings.catch_warnings():  # a version that was asked for by name is no mistake
             warnings.filterwarnings("ignore", ".*is out of date", DeprecationWarning)
-            env = gymnasium.make(name, max_episode_steps=-1, disable_env_checker=True, **wanted)
+            env = gymnasium.make(
+                self.env_id, max_episode_steps=-1, disable_env_checker=True, **wanted
+            )
         # The batch itself refuses a step before the first reset.
         env = env.env if isinstance(env, OrderEnforcing) else env
         for wrapper in wrappers:
@@ -123,18 +115,12 @@ class GymnasiumBatchEnv(SimulatorBatch):
         )  # fmt: skip
 
     def _advance(self, rows: NDArray[np.int64] | None, arrays: StepArrays) -> None:
-        if rows is not None:
-            self._step_rows(rows.tolist(), arrays)
-        elif self.num_threads == 1:
-            self._step_rows(self._shares[0], arrays)
-        else:
-            # Each thread writes rows of its own, so that their order is free.
-            if self._pool is None:
-                self._pool = ThreadPoolExecutor(len(self._shares) - 1, "gymnasium-batch")
-            others = [self._pool.submit(self._step_rows, s, arrays) for s in self._shares[1:]]
-            self._step_rows(self._shares[0], arrays)
-            for other in others:
-                other.result()
+        shares = self._shares if rows is None else [rows.tolist()]
+        # Each thread writes rows of its own, so that their order is free.
+        others = [self._pool.submit(self._step_rows, share, arrays) for share in shares[1:]]
+        self._step_rows(shares[0], arrays)
+        for other in others:
+            other.result()
 
     def _step_rows(self, rows: Sequence[int], arrays: StepArrays) -> None:
         """Step the environments ``rows`` one after the other and write what they return."""
@@ -177,28 +163,21 @@ class GymnasiumBatchEnv(SimulatorBatch):
     def _close_simulators(self) -> None:
         for env in self.envs:
             env.close()
-        if self._pool is not None:
-            self._pool.shutdown()
-            self._pool = None
+        self._pool.shutdown()
 
     # Saving ---------------------------------------------------------------------------------
 
     @property
     def supports_state(self) -> bool:
         """Whether the whole state can be saved: True for plain MuJoCo environments."""
-        return all(is_mujoco(env) for env in self.envs)
+        return all(isinstance(env, MujocoEnv) for env in self.envs)
 
     def _rows_state(self) -> dict[str, NDArray[Any]]:
         names = ("elapsed", "seeds", "started", "observation", "engine_resets")
         return {name: getattr(self, f"_{name}") for name in names}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the whole state as tensors, which ``torch.load(weights_only=True)`` reads.
-
-        ``simulators`` (see ``simulator_state``) and for every row ``elapsed`` steps since the
-        reset, ``seeds`` of the next reset (-1: none), ``started``, ``observation`` and
-        ``engine_resets``. Empty where :attr:`supports_state` is False.
-        """
+        """Return the whole state as tensors, which ``torch.load(weights_only=True)`` reads."""
         if not self.supports_state:
             return super().get_extra_state()
         rows = {name: torch.from_numpy(array.copy()) for name, array in self._rows_state().items()}

@@ -18,8 +18,6 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-__all__ = ["NO_SEED", "SimulatorBatch", "SimulatorError", "StepArrays", "one_line"]
-
 NO_SEED = -1
 
 
@@ -38,11 +36,10 @@ class StepArrays(NamedTuple):
 
 
 class SimulatorBatch(EnvBase):
-    """Step many simulators of one task as one environment with batch size ``[num_envs]``.
+    """Step many simulators of one task as one environment, see ``GymnasiumBatchEnv``.
 
     A backend makes its simulators in :meth:`_build` and steps and resets them on NumPy arrays in
-    :meth:`_advance` and :meth:`_restart`, so that backends do not differ in keys, specs or the way
-    an episode ends. Arguments and errors: see :class:`~torchrl_drbpn.GymnasiumBatchEnv`.
+    :meth:`_advance` and :meth:`_restart`.
     """
 
     def __init__(
@@ -103,10 +100,7 @@ class SimulatorBatch(EnvBase):
         """Free the simulators and their threads."""
 
     def _chosen(self, space: Any) -> Any:
-        """Return what is read of an observation: all of it, or a dictionary of what is asked for.
-
-        A dictionary is flattened in the order of ``observation_keys``.
-        """
+        """Return the space of what is read: all, or a dictionary in the order asked for."""
         keys, known = self.joined_keys, getattr(space, "spaces", {})
         if keys is None:
             return space
@@ -271,12 +265,9 @@ class SimulatorBatch(EnvBase):
             self._close_simulators()
         self.is_closed = True
 
-    def __repr__(self) -> str:
+    def extra_repr(self) -> str:
         """Name task, number of environments, device and dtype."""
-        return (
-            f"{type(self).__name__}({self.env_id!r}, num_envs={self.num_envs}, "
-            f"device={self.device}, dtype={self.dtype})"
-        )
+        return f"{self.env_id!r}, num_envs={self.num_envs}, device={self.device}, dtype={self.dtype}"
 
 
 def one_line(thing: object) -> str:

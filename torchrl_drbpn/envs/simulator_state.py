@@ -13,13 +13,12 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
+import mujoco
 import numpy as np
 import torch
 from gymnasium.utils import seeding
 
-__all__ = ["is_mujoco", "load_state", "save_state"]
-
+_INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 # Derived quantities of fixed size. Contacts and constraints are left out: a step makes them anew.
 # fmt: off
 _DERIVED = (
@@ -32,15 +31,6 @@ _DERIVED = (
 # fmt: on
 
 
-def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:
-    """Return whether ``env`` is a plain MuJoCo environment of Gymnasium, without wrappers."""
-    if env.unwrapped is not env:
-        return False
-    from gymnasium.envs.mujoco import MujocoEnv  # imports mujoco, which not every task needs
-
-    return isinstance(env, MujocoEnv)
-
-
 def save_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
     """Return the whole state of MuJoCo environments of one task as tensors.
 
@@ -48,12 +38,9 @@ def save_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
     ``(num_envs, size)``, ``generators`` uint8 ``(bytes,)`` is JSON with one entry an environment:
     its random generator (whose integers have 128 bits) and its plain numbers.
     """
-    import mujoco
-
-    what = mujoco.mjtState.mjSTATE_INTEGRATION
-    physics = np.empty((len(envs), mujoco.mj_stateSize(envs[0].model, what)))
+    physics = np.empty((len(envs), mujoco.mj_stateSize(envs[0].model, _INTEGRATION)))
     for env, row in zip(envs, physics, strict=True):
-        mujoco.mj_getState(env.model, env.data, row, what)
+        mujoco.mj_getState(env.model, env.data, row, _INTEGRATION)
     derived = [np.concatenate([field.ravel() for field in _derived(env.data)]) for env in envs]
     held = [
         {"generator": env.np_random.bit_generator.state, "numbers": _numbers(env)} for env in envs
@@ -66,22 +53,9 @@ def save_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
 
 
 def load_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) -> None:
-    """Put environments into a state of :func:`save_state`; a ValueError if it does not fit.
-
-    Examples:
-        >>> env = gymnasium.make("Hopper-v5").unwrapped
-        >>> _ = env.reset(seed=0)
-        >>> saved, action = save_state([env]), np.ones(3)
-        >>> first = env.step(action)[0]
-        >>> load_state([env], saved)
-        >>> bool((env.step(action)[0] == first).all())
-        True
-    """
-    import mujoco
-
-    what = mujoco.mjtState.mjSTATE_INTEGRATION
+    """Put environments into a state of :func:`save_state`; a ValueError if it does not fit."""
     sizes = {
-        "physics": mujoco.mj_stateSize(envs[0].model, what),
+        "physics": mujoco.mj_stateSize(envs[0].model, _INTEGRATION),
         "derived": sum(field.size for field in _derived(envs[0].data)),
     }
     for name, size in sizes.items():
@@ -101,9 +75,9 @@ def load_state(envs: Sequence[Any], state: dict[str, torch.Tensor]) -> None:
     for env, numbers, values, own in zip(envs, *arrays, held, strict=True):
         # Forward makes contacts and whatever is not in the two lists; it comes first because it
         # also overwrites what they hold.
-        mujoco.mj_setState(env.model, env.data, numbers, what)
+        mujoco.mj_setState(env.model, env.data, numbers, _INTEGRATION)
         mujoco.mj_forward(env.model, env.data)
-        mujoco.mj_setState(env.model, env.data, numbers, what)
+        mujoco.mj_setState(env.model, env.data, numbers, _INTEGRATION)
         for field in _derived(env.data):
             field[...] = values[: field.size].reshape(field.shape)
             values = values[field.size :]

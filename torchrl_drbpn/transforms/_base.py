@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, TypedDict
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform, TransformedEnv
@@ -122,16 +123,6 @@ def check_mask(mask: Tensor | TensorSpec, observation: Tensor | TensorSpec, key:
 
 
 # ------------------------------------------------------------------------------------------ specs
-def unbounded_like(leaf: TensorSpec) -> Unbounded:
-    """Return an unbounded spec with the shape, device and dtype of `leaf`."""
-    return Unbounded(shape=leaf.shape, device=leaf.device, dtype=leaf.dtype)
-
-
-def mask_like(leaf: TensorSpec) -> Binary:
-    """Return the spec of a boolean mask with the shape and device of `leaf`."""
-    return Binary(shape=leaf.shape, device=leaf.device, dtype=torch.bool)
-
-
 def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transform) -> None:
     """Enter a key into `spec` that nothing else may write."""
     if key in spec.keys(True, True):
@@ -170,15 +161,12 @@ def flagged_rows(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> T
         flag = tensordict.get((*folders[:depth], "_reset"), None)
         if flag is not None:
             rows = flag.flatten(tensordict.ndim).any(-1) if flag.ndim > tensordict.ndim else flag
-            return rows.reshape(*rows.shape, *(1,) * (value.ndim - rows.ndim)).expand_as(value)
+            return expand_as_right(rows, value)
     return None
 
 
 class EnvironmentTransform(Transform):
-    """A transform that works in an environment alone; `why_online` is the reason it gives.
-
-    A replay buffer, which it refuses, calls `inv` on what comes in and `forward` on what goes out.
-    """
+    """A transform that works in an environment alone; `why_online` is the reason it gives."""
 
     why_online: ClassVar[str]
 
@@ -190,6 +178,7 @@ class EnvironmentTransform(Transform):
         )
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # a replay buffer calls `inv` on what comes in and `forward` on what goes out
         if environment_of(self) is None:
             raise self._refuse()
         return tensordict
@@ -205,14 +194,13 @@ class Step(NamedTuple):
 
     Attributes:
         observation: shape `(*batch, obs)`, the keys of one vector side by side.
-        observed: the mask so far, bool, same shape; None for all. Entries that it hides become 0
-            whatever `_corrupt` makes of them.
+        observed: the mask so far, bool, same shape.
         before: the data of the step before, with the action; None at a reset.
         data: the data of this step, where what was drawn may be written.
     """
 
     observation: Tensor
-    observed: Tensor | None
+    observed: Tensor
     before: TensorDictBase | None
     data: TensorDictBase
 
@@ -236,8 +224,6 @@ class CorruptingTransform(Transform, ABC):
 
     role: ClassVar[Role]
     writes_mask: ClassVar[bool] = True
-    # where what arrives is of an earlier step, the mask of this one must not be ANDed into it
-    ands_mask: ClassVar[bool] = True
     # attributes that hold one number for all components, or one for each
     per_component: ClassVar[tuple[str, ...]] = ()
     out_keys: list[NestedKey]
@@ -260,63 +246,56 @@ class CorruptingTransform(Transform, ABC):
         super().__init__(in_keys=keys, out_keys=out_keys)
         self.mask_keys, self.complete_keys = masks, complete
         self._checked = False
-        of_next = [isinstance(key, tuple) and key[0] == "next" for key in keys]
-        self._vectors = [
-            [place for place, there in enumerate(of_next) if there is following]
-            for following in sorted(set(of_next))
-        ]
+        rows = list(zip(keys, masks, complete or [None] * len(keys), strict=True))
+        here = [row for row in rows if row[0][:1] != ("next",)]
+        self._vectors = [vector for vector in (here, [r for r in rows if r not in here]) if vector]
 
     @abstractmethod
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
-        """Return the observation as it arrives, and which entries do; None for all."""
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
+        """Return the observation as it arrives, and the mask; the frame sets what it hides to 0."""
 
     def _check_obs_dim(self, obs_dim: int) -> None:
         """Raise a ValueError where the transform was made for another number of components."""
         for name in self.per_component:
             check_count(getattr(self, name), name, obs_dim, "component")
 
-    def _check(self, source: Composite | TensorDictBase) -> list[Any]:
-        """Return the specs or the data of the observations, checked."""
-        leaves = [read_vector(source, key, self) for key in self.in_keys]
-        for mask_key, leaf in zip(self.mask_keys, leaves, strict=True):
-            if mask_key in source.keys(True, True):
-                check_mask(source[mask_key], leaf, mask_key)
-        for vector in ([leaves[place] for place in places] for places in self._vectors):
-            if any(leaf.shape[:-1] != vector[0].shape[:-1] for leaf in vector):
+    def _check(self, source: Composite | TensorDictBase) -> None:
+        """Check the specs or the data of the observations."""
+        for vector in self._vectors:
+            leaves = [read_vector(source, key, self) for key, _, _ in vector]
+            for (_, mask_key, _), leaf in zip(vector, leaves, strict=True):
+                if mask_key in source.keys(True, True):
+                    check_mask(source[mask_key], leaf, mask_key)
+            if any(leaf.shape[:-1] != leaves[0].shape[:-1] for leaf in leaves):
                 raise ValueError(
                     f"`in_keys` {self.in_keys} must share their batch to count as one vector, got "
-                    f"shapes {[tuple(leaf.shape) for leaf in vector]}. Give each batch a transform "
+                    f"shapes {[tuple(leaf.shape) for leaf in leaves]}. Give each batch a transform "
                     "of its own."
                 )
-            self._check_obs_dim(sum(leaf.shape[-1] for leaf in vector))
-        return leaves
+            self._check_obs_dim(sum(leaf.shape[-1] for leaf in leaves))
 
     # ------------------------------------------------------------------------------- on tensors
     def _run(self, tensordict: TensorDictBase, before: TensorDictBase | None) -> TensorDictBase:
         if not self._checked:
             self._check(tensordict)
             self._checked = True
-        for places in self._vectors:
-            parts: list[Tensor] = [tensordict.get(self.in_keys[place]) for place in places]
-            masks = [tensordict.get(self.mask_keys[place], None) for place in places]
-            observed = None
-            if any(mask is not None for mask in masks):
-                pairs = zip(parts, masks, strict=True)
-                masks = [torch.ones_like(p, dtype=torch.bool) if m is None else m for p, m in pairs]
-                observed = _join(masks)
-            corrupted, arrived = self._corrupt(Step(_join(parts), observed, before, tensordict))
-            if observed is not None and (arrived is None or self.ands_mask):
-                arrived = observed if arrived is None else arrived & observed
-            if arrived is not None:
-                corrupted = zero_missing(corrupted, arrived)
-            written = [(self.in_keys, split_like(corrupted, parts))]
-            if self.complete_keys:
-                written.append((self.complete_keys, parts))
-            if self.writes_mask and arrived is not None:
-                written.append((self.mask_keys, split_like(arrived, parts)))
-            for keys, values in written:
-                for place, value in zip(places, values, strict=True):
-                    tensordict.set(keys[place], value)
+        for vector in self._vectors:
+            parts: list[Tensor] = [tensordict.get(key) for key, _, _ in vector]
+            masks = [tensordict.get(key, None) for _, key, _ in vector]
+            masks = [
+                torch.ones_like(part, dtype=torch.bool) if mask is None else mask
+                for part, mask in zip(parts, masks, strict=True)
+            ]
+            step = Step(torch.cat(parts, -1), torch.cat(masks, -1), before, tensordict)
+            corrupted, observed = self._corrupt(step)
+            arrived = split_like(zero_missing(corrupted, observed), parts)
+            written = zip(vector, parts, arrived, split_like(observed, parts), strict=True)
+            for (key, mask_key, complete_key), part, value, mask in written:
+                tensordict.set(key, value)
+                if self.writes_mask:
+                    tensordict.set(mask_key, mask)
+                if complete_key is not None:
+                    tensordict.set(complete_key, part)
         return tensordict
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -340,13 +319,14 @@ class CorruptingTransform(Transform, ABC):
         """Widen the observation, enter its mask and, on request, the complete observation."""
         self._check_order()
         spec = observation_spec.clone()
-        leaves = self._check(spec)
-        for key, leaf in zip(self.complete_keys, leaves, strict=bool(self.complete_keys)):
-            enter_new(spec, key, leaf.clone(), self)
-        for key, mask_key, leaf in zip(self.in_keys, self.mask_keys, leaves, strict=True):
+        self._check(spec)
+        for key, mask_key, complete_key in (row for vector in self._vectors for row in vector):
+            leaf = spec[key]
+            if complete_key is not None:
+                enter_new(spec, complete_key, leaf.clone(), self)
             if self.writes_mask:
-                spec[mask_key] = mask_like(leaf)
-            spec[key] = unbounded_like(leaf)
+                spec[mask_key] = Binary(shape=leaf.shape, device=leaf.device, dtype=torch.bool)
+            spec[key] = Unbounded(leaf.shape, leaf.device, leaf.dtype)
         return spec
 
     def _check_order(self) -> None:
@@ -368,11 +348,6 @@ class CorruptingTransform(Transform, ABC):
                 )
 
 
-def _join(parts: list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-
-
 def split_like(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
     """Cut one vector into pieces as wide as `parts`."""
-    sizes = [part.shape[-1] for part in parts]
-    return [joined] if len(parts) == 1 else torch.split(joined, sizes, -1)
+    return torch.split(joined, [part.shape[-1] for part in parts], -1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from numbers import Integral
 from typing import Any, ClassVar, Unpack
 
@@ -19,7 +19,6 @@ from torchrl_drbpn.transforms._base import (
     check_count,
     enter_new,
     read_numbers,
-    read_vector,
     sibling_key,
 )
 from torchrl_drbpn.transforms.seeding import SeededKeys, SeededTransform
@@ -27,33 +26,18 @@ from torchrl_drbpn.transforms.seeding import SeededKeys, SeededTransform
 Groups = Sequence[Sequence[int]]
 
 
-class GroupedKeys(SeededKeys, total=False):
-    """And the sensors that go together."""
+class CarriedKeys(SeededKeys, total=False):
+    """And the sensors that go together, and where the state is kept."""
 
     groups: Groups | None
-
-
-class CarriedKeys(GroupedKeys, total=False):
-    """And where the state is kept."""
-
     state_keys: Keys | None
 
 
 class CarriedStateTransform(SeededTransform):
     """A corrupting transform that remembers something from step to step.
 
-    What it remembers travels in the tensordict, as the counts of TorchRL's `StepCounter` do, so
-    that partial resets and workers hold and a stored step says what the next starts from. A
-    simulator that resets itself inside its step carries it over to the next episode. A subclass
-    names its states and says of what shape they are.
-
-    Args:
-        groups: lists of indices of sensors that go together (negative ones count from the end),
-            each index in one list at most, over all keys of one vector; what is in none is left
-            alone. None: every component by itself.
-        state_keys: where the states are kept; None: under `state_names` beside the first
-            observation.
-        **keys: passed on to `SeededTransform`.
+    What it remembers travels in the tensordict, so that partial resets and workers hold and a
+    stored step says what the next starts from.
     """
 
     state_names: ClassVar[tuple[str, ...]]
@@ -85,7 +69,7 @@ class CarriedStateTransform(SeededTransform):
 
     # ------------------------------------------------------------------------------------ groups
     def _count(self, obs_dim: int) -> int:
-        """Return how many groups there are; without groups every component is one."""
+        """Return how many groups there are; without `groups` every component is one."""
         return obs_dim if self.groups is None else len(self.groups)
 
     def _group_like(self, observation: Tensor) -> Tensor:
@@ -158,14 +142,13 @@ class CarriedStateTransform(SeededTransform):
         for key, state in zip(self.state_keys, states, strict=True):
             step.data.set(key, state)
 
-    def _state_specs(self, spec: Composite) -> list[tuple[NestedKey, TensorSpec]]:
-        leaves = [read_vector(spec, key, self) for key in self.in_keys]
-        made: list[TensorSpec] = []
-        for event, dtype in self._layout(sum(leaf.shape[-1] for leaf in leaves)):
+    def _state_specs(self, spec: Composite) -> Iterator[tuple[NestedKey, TensorSpec]]:
+        leaves = [spec[key] for key in self.in_keys]
+        layout = self._layout(sum(leaf.shape[-1] for leaf in leaves))
+        for key, (event, dtype) in zip(self.state_keys, layout, strict=True):
             shape, device = (*leaves[0].shape[:-1], *event), leaves[0].device
             kind = Binary if dtype is torch.bool else Unbounded
-            made.append(kind(shape=shape, device=device, dtype=dtype or leaves[0].dtype))
-        return list(zip(self.state_keys, made, strict=True))
+            yield key, kind(shape=shape, device=device, dtype=dtype or leaves[0].dtype)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Enter the observation, its mask, the states and, on request, what was complete."""

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import Composite
+from torchrl.data import Composite, Unbounded
 
 from torchrl_drbpn.transforms._base import (
     EnvironmentTransform,
@@ -17,7 +17,6 @@ from torchrl_drbpn.transforms._base import (
     flagged_rows,
     pair_keys,
     read_vector,
-    unbounded_like,
 )
 
 
@@ -25,19 +24,16 @@ class FillLastObserved(EnvironmentTransform):
     r"""Replace missing entries by the last observed value of the same episode.
 
     filled_t = x_t where observed, filled_{t-1} elsewhere, `fill_value` before the first observed
-    value of an episode. The mask stays as it is. The last values travel in the tensordict, as the
-    counts of TorchRL's `StepCounter` do, so partial resets and batched environments hold.
+    value of an episode. The mask stays as it is. The last values travel in the tensordict.
 
     Args:
         in_keys: observations, shape `(*batch, obs)`, floating point.
-        mask_keys: one mask per observation, bool, shape `(*batch, obs)`, True where observed.
-            Default `"observed"` beside each observation.
+        mask_keys: one mask per observation, bool, same shape. Default `"observed"` beside each.
         out_keys: where to write. Default in place.
 
     Keyword Args:
-        fill_value: what stands in for an entry never observed in this episode, in the units that
-            the observation has at this place of the chain; NaN marks it for
-            `MaskedObservationNorm(missing="keep")`.
+        fill_value: what stands in for an entry never observed in this episode, in the units of the
+            observation here; NaN marks it for `MaskedObservationNorm(missing="keep")`.
         state_keys: where the last values are kept. Default `last_<name>` beside each observation.
 
     Raises:
@@ -123,12 +119,14 @@ class FillLastObserved(EnvironmentTransform):
         """Enter the filled observations and the last values, unbounded."""
         self._check(observation_spec)
         for key, _, out_key, state_key in self._keys:
-            leaf = unbounded_like(observation_spec[key])
-            observation_spec[out_key], observation_spec[state_key] = leaf, leaf.clone()
+            leaf = observation_spec[key]
+            for written in (out_key, state_key):
+                observation_spec[written] = Unbounded(leaf.shape, leaf.device, leaf.dtype)
         return observation_spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         """Enter the last values as a state that a step reads."""
         for key, _, _, state_key in self._keys:
-            state_spec[state_key] = unbounded_like(self.parent.full_observation_spec[key])
+            leaf = self.parent.full_observation_spec[key]
+            state_spec[state_key] = Unbounded(leaf.shape, leaf.device, leaf.dtype)
         return state_spec

@@ -45,8 +45,8 @@ class ObservationMissingness(SeededTransform):
 
     x is the observation that reaches the transform, noise included. The always observed components
     (round(always_observed * obs), at least 1) and b0, b1, b2 ~ N(0, 1) are drawn together from
-    `mechanism_seed`: the same for every method, training seed and evaluation, untouched by
-    `seed_env`. MAR and NMAR realise clearly less than $\eta$: report the realised ratio as well.
+    `mechanism_seed`, untouched by `seed_env`. MAR and NMAR realise clearly less than $\eta$: report
+    the realised ratio as well.
 
     Missing entries become 0, NaN and inf beneath included, and False in the mask, which is ANDed
     into one that is there already. Several observation keys count as one vector.
@@ -123,19 +123,20 @@ class ObservationMissingness(SeededTransform):
             raise ValueError(f"`eta` must be a missing rate in [0, 1], got {eta!r}.")
         self._eta = float(eta)
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x, generator = step.observation, self.generator(step.observation.device)
         if self.mechanism == "mcar":
-            return x, sample_mask(self._eta, x, generator)
+            return x, sample_mask(self._eta, x, generator) & step.observed
         action = None if step.before is None else self._action(step.before, x)
         # what an earlier transform hides does not enter the probability
-        seen = x if step.observed is None else zero_missing(x, step.observed)
+        seen = zero_missing(x, step.observed)
         sizes = x.shape[-1], 0 if action is None else action.shape[-1]
         draw = self.mechanism, sizes, self.always_observed, self.mechanism_seed
         mechanism = _drawn(*draw, x.dtype, x.device)
         if action is not None:
             self.mechanism_parameters = mechanism
-        return x, sample_mask(missing_probability(mechanism, seen, action, self._eta), x, generator)
+        probability = missing_probability(mechanism, seen, action, self._eta)
+        return x, sample_mask(probability, x, generator) & step.observed
 
     def _action(self, before: TensorDictBase, observation: Tensor) -> Tensor:
         action: Tensor | None = before.get(self.action_key, None)
@@ -174,10 +175,9 @@ class SensorReduction(CorruptingTransform):
     `in_keys=["observation", ("next", "observation")]` both lose the same sensors.
 
     Args:
-        missing: the components without a sensor; indices (negative ones count from the end), or
-            bool of shape `(obs,)`, True where there is none, or of shape `(*batch, obs)`, with the
-            batch of the data: each row, such as each environment of a batch, lacks sensors of its
-            own. Several observation keys count as one vector.
+        missing: the components without a sensor: indices (negative ones count from the end), bool
+            of shape `(obs,)`, True where there is none, or bool of shape `(*batch, obs)`, where
+            each row, such as each environment of a batch, lacks sensors of its own.
         **keys: `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Example:
@@ -208,7 +208,6 @@ class SensorReduction(CorruptingTransform):
                 f"True where there is no sensor, got {missing!r}."
             )
         self.missing = tensor
-        self._present: Tensor | None = None
 
     def _check_obs_dim(self, obs_dim: int) -> None:
         missing, where = self.missing, f"for in_keys {self.in_keys} with {obs_dim} components"
@@ -218,21 +217,19 @@ class SensorReduction(CorruptingTransform):
                     f"`missing` as bool must have one entry per component {where}, got "
                     f"{missing.shape[-1]}."
                 )
-        elif bool(((missing < -obs_dim) | (missing >= obs_dim)).any()):
+            self._present = ~missing
+            return
+        if bool(((missing < -obs_dim) | (missing >= obs_dim)).any()):
             raise ValueError(
                 f"`missing` must hold indices from {-obs_dim} to {obs_dim - 1} {where}, got "
                 f"{missing.tolist()}."
             )
+        self._present = torch.ones(obs_dim, dtype=torch.bool)
+        self._present[missing] = False
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
-        observation, present = step.observation, self._present
-        if present is None or present.device != observation.device:
-            if self.missing.dtype == torch.bool:
-                present = ~self.missing
-            else:
-                present = torch.ones(observation.shape[-1], dtype=torch.bool)
-                present[self.missing] = False
-            present = self._present = present.to(observation.device)
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
+        observation = step.observation
+        present = self._present.to(observation.device)
         if present.ndim > 1 and present.shape != observation.shape:
             # never broadcast: rows that were meant for other environments would go unnoticed
             raise ValueError(
@@ -240,16 +237,14 @@ class SensorReduction(CorruptingTransform):
                 f"(*batch, obs) = {tuple(observation.shape)}, got {tuple(present.shape)}. One "
                 "choice for all rows has the shape (obs,)."
             )
-        # a tensor of its own: what is expanded shares memory between rows
-        return observation, present.expand(observation.shape).clone()
+        return observation, present & step.observed
 
 
 class ObservedFromNaN(CorruptingTransform):
     """Read NaN as "did not arrive": NaN becomes 0 and False in the mask.
 
-    The way in for real sensors that fail, in an environment or on a replay buffer. Where there is a
-    mask already, an entry counts as observed if that mask is True and the value is not NaN.
-    Infinite values are left: they are errors, not gaps.
+    The way in for real sensors that fail, in an environment or on a replay buffer. Infinite values
+    are left: they are errors, not gaps.
 
     Args:
         **keys: `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
@@ -264,5 +259,5 @@ class ObservedFromNaN(CorruptingTransform):
 
     role: ClassVar[Role] = "from_nan"
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
-        return step.observation, ~step.observation.isnan()
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
+        return step.observation, ~step.observation.isnan() & step.observed

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, TypeAlias, Unpack
 
+import torch
 from tensordict import NestedKey
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import Binary, Composite
 
 from torchrl_drbpn.functional.missingness import sample_noise, sample_spikes
 from torchrl_drbpn.transforms._base import (
@@ -15,7 +16,6 @@ from torchrl_drbpn.transforms._base import (
     Role,
     Step,
     enter_new,
-    mask_like,
     pair_keys,
     read_numbers,
     split_like,
@@ -57,9 +57,10 @@ class ObservationNoise(SeededTransform):
         super().__init__(**keys)
         self.noise_std = read_numbers(noise_std, "noise_std", STD)
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x = step.observation
-        return x + sample_noise(self.noise_std.to(x), x, self.generator(x.device)), None
+        noise = sample_noise(self.noise_std.to(x), x, self.generator(x.device))
+        return x + noise, step.observed
 
 
 class ObservationSpikes(SeededTransform):
@@ -71,8 +72,7 @@ class ObservationSpikes(SeededTransform):
     independently for every entry and step: with `ObservationNoise` before it the error is the
     contaminated normal $(1 - p) N(0, \sigma^2) + p N(0, \sigma^2 + \text{spike\_std}^2)$ of Tukey
     ("A survey of sampling from contaminated distributions", 1960). A spiked entry arrives: its mask
-    stays True, and a model that trusts every reading is misled. Entries that a mask declares
-    missing stay 0 and are not spiked. Spec bounds are lifted.
+    stays True. Entries that a mask declares missing stay 0 and are not spiked.
 
     Args:
         probability: that an entry is hit at a step, in [0, 1]; a number for all components, or one
@@ -81,8 +81,7 @@ class ObservationSpikes(SeededTransform):
 
     Keyword Args:
         spiked_key: key (or one key per observation) under which the entries that were hit are
-            recorded, bool `(*batch, obs)`; None, the default, records nothing. For evaluation: no
-            policy should read it.
+            recorded, bool `(*batch, obs)`; None, the default, records nothing.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Example:
@@ -121,20 +120,22 @@ class ObservationSpikes(SeededTransform):
         self.probability = read_numbers(probability, "probability", share, most=1.0)
         self.spike_std = read_numbers(spike_std, "spike_std", STD)
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x = step.observation
         probability, std = self.probability.to(x), self.spike_std.to(x)
         error, hit = sample_spikes(probability, std, x, self.generator(x.device))
         if self.spiked_keys:
-            arrived = hit if step.observed is None else hit & step.observed
-            parts = split_like(arrived, [step.data.get(key) for key in self.in_keys])
-            for key, part in zip(self.spiked_keys, parts, strict=True):
+            parts = [step.data.get(key) for key in self.in_keys]
+            arrived = split_like(hit & step.observed, parts)
+            for key, part in zip(self.spiked_keys, arrived, strict=True):
                 step.data.set(key, part)
-        return x + error, None
+        return x + error, step.observed
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Widen the observation and enter, on request, what was complete and what was hit."""
         spec = super().transform_observation_spec(observation_spec)
         for key, spiked in zip(self.in_keys, self.spiked_keys, strict=False):
-            enter_new(spec, spiked, mask_like(spec[key]), self)
+            leaf = spec[key]
+            mask = Binary(shape=leaf.shape, device=leaf.device, dtype=torch.bool)
+            enter_new(spec, spiked, mask, self)
         return spec

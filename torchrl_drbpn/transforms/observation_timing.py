@@ -27,9 +27,8 @@ class ObservationDelay(CarriedStateTransform):
     `in_order=True`. What arrives counts as observed and is d steps old: nothing tells its age.
 
     With a delay of d the first d steps of an episode show nothing. A reading that a mask hides was
-    never sent: the mask so far is delayed with its readings. What is on its way, max_delay
-    observations a step, travels in the tensordict under `state_keys`. A simulator that resets
-    itself inside its step lets the last readings of an episode arrive in the next one.
+    never sent: the mask so far is delayed with its readings. A simulator that resets itself inside
+    its step lets the last readings of an episode arrive in the next one.
 
     Args:
         delay: steps, 0 or more; a number for all, or one for each group (each component, where
@@ -46,9 +45,8 @@ class ObservationDelay(CarriedStateTransform):
             `ObservationMissingness`.
 
     Raises:
-        ValueError: for numbers out of range; when the environment is asked for its specs, also if
-            its `StepCounter` ends episodes before the first reading of a sensor can arrive. Other
-            time limits can't be seen from here.
+        ValueError: for numbers out of range, and where a `StepCounter` of the environment ends
+            episodes before the first reading of a sensor can arrive; other limits are not seen.
 
     Example:
         >>> from tensordict import TensorDict
@@ -60,7 +58,6 @@ class ObservationDelay(CarriedStateTransform):
     """
 
     role: ClassVar[Role] = "missingness"
-    ands_mask: ClassVar[bool] = False
     stream: ClassVar[int] = 5
     state_names: ClassVar[tuple[str, ...]] = ("delayed_observation", "delayed_observed")
     per_group: ClassVar[tuple[str, ...]] = ("delay", "max_delay")
@@ -90,7 +87,7 @@ class ObservationDelay(CarriedStateTransform):
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         return [((self._places, obs_dim), None), ((self._places, obs_dim), torch.bool)]
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x, carried = step.observation, self._carried(step)
         least, most = self.delay.to(x.device), self.max_delay.to(x.device)
         delay = least
@@ -104,8 +101,7 @@ class ObservationDelay(CarriedStateTransform):
         else:
             waiting, due = (torch.cat([s, torch.zeros_like(s[..., :1, :])], -2) for s in carried)
         place = torch.arange(self._places + 1, device=x.device).unsqueeze(-1)
-        sent = torch.ones_like(x, dtype=torch.bool) if step.observed is None else step.observed
-        sent = sent.unsqueeze(-2)
+        sent = step.observed.unsqueeze(-2)
         sent_there = (place == delay) & sent
         waiting = torch.where(sent_there, x.unsqueeze(-2), waiting)
         due = due | sent_there
@@ -183,7 +179,7 @@ class ObservationMultiRate(CarriedStateTransform):
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         return [((self._count(obs_dim),), torch.int64)]
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x, carried = step.observation, self._carried(step)
         like, last = self._group_like(x), self.period.to(x.device) - 1
         if carried is not None:
@@ -193,4 +189,4 @@ class ObservationMultiRate(CarriedStateTransform):
         else:
             left = sample_delay(torch.zeros_like(last), last, like, self.generator(x.device))
         self._carry(step, left)
-        return x, self._spread(left, x, 0) == 0
+        return x, (self._spread(left, x, 0) == 0) & step.observed

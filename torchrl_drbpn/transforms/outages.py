@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchrl_drbpn.functional.missingness import outage_rates, sample_working
 from torchrl_drbpn.transforms._base import Role, Step
-from torchrl_drbpn.transforms._carried import CarriedStateTransform, GroupedKeys
+from torchrl_drbpn.transforms._carried import CarriedStateTransform, Groups
+from torchrl_drbpn.transforms.seeding import SeededKeys
 
 _INITIAL = ("stationary", "on")
 
@@ -28,17 +29,14 @@ class SensorOutages(CarriedStateTransform):
     $L = 1/(1 - \eta)$ is MCAR at $\eta$; a shorter L makes sensors alternate, L = 1 at $\eta = .5$
     strictly.
 
-    The realised ratio: with `initial="stationary"` every entry of every step, the first included,
-    is missing with probability exactly $\eta$. With `initial="on"` every sensor works at a reset
-    and t steps later is off with probability $\eta (1 - (1 - a - b)^t)$, a and b being the two
-    probabilities above. Steps are not independent, so that ratios of single episodes scatter more
-    than under MCAR: report the realised one.
+    With `initial="stationary"` every entry of every step, the first included, is missing with
+    probability exactly $\eta$. With `initial="on"` every sensor works at a reset and t steps later
+    is off with probability $\eta (1 - (1 - a - b)^t)$, a and b being the two probabilities above.
+    Ratios of single episodes scatter more than under MCAR: report the realised one.
 
     Which sensors work travels in the tensordict under `state_key`, as the counts of TorchRL's
-    `StepCounter` do, so that partial resets and workers hold and a stored step says what the next
-    starts from. A simulator that resets itself inside its step carries outages over to the next
-    episode, whatever `initial` says. Missing entries become 0 and False in the mask, which is ANDed
-    into one that is there already.
+    `StepCounter` do. A simulator that resets itself inside its step carries outages over to the
+    next episode, whatever `initial` says.
 
     Args:
         eta: long-run missing ratio of the sensors that can fail, in [0, 1).
@@ -49,9 +47,8 @@ class SensorOutages(CarriedStateTransform):
         groups: lists of indices of sensors that go together (negative ones count from the end),
             each index in one list at most; entries in none always arrive. None, the default: every
             entry by itself.
-        state_key: where the state is kept, bool `(*batch, groups)`, True for a group that works; by
-            default `sensor_on` beside the first observation. Two `SensorOutages` in one environment
-            need two.
+        state_key: bool `(*batch, groups)`, True for a group that works; by default `sensor_on`
+            beside the first observation. Two `SensorOutages` in one environment need two.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Example:
@@ -76,10 +73,11 @@ class SensorOutages(CarriedStateTransform):
         mean_length: float,
         *,
         initial: Literal["stationary", "on"] = "stationary",
+        groups: Groups | None = None,
         state_key: NestedKey | None = None,
-        **keys: Unpack[GroupedKeys],
+        **keys: Unpack[SeededKeys],
     ) -> None:
-        super().__init__(state_keys=state_key, **keys)
+        super().__init__(groups=groups, state_keys=state_key, **keys)
         self.rates = outage_rates(eta, mean_length)
         self.eta, self.mean_length = float(eta), float(mean_length)
         if initial not in _INITIAL:
@@ -89,7 +87,7 @@ class SensorOutages(CarriedStateTransform):
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         return [((self._count(obs_dim),), torch.bool)]
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x = step.observation
         like, before = self._group_like(x), self._carried(step)
         if before is None and self.initial == "on":
@@ -98,5 +96,4 @@ class SensorOutages(CarriedStateTransform):
             previous = None if before is None else before[0]
             working = sample_working(previous, self.rates, like, self.generator(x.device))
         self._carry(step, working)
-        # the mask may be changed by who gets it, the state is for the next step
-        return x, self._spread(working, x, True).clone()
+        return x, self._spread(working, x, True) & step.observed

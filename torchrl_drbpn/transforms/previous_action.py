@@ -6,18 +6,16 @@ from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Categorical, Composite, Unbounded
 
 from torchrl_drbpn.transforms._base import (
     EnvironmentTransform,
     Keys,
     as_key_list,
     flagged_rows,
-    mask_like,
     pair_keys,
     read_leaf,
     sibling_key,
-    unbounded_like,
 )
 
 
@@ -29,8 +27,8 @@ class PreviousAction(EnvironmentTransform):
     the environment clips it and before any action transform that stands earlier in the chain
     rescales it; action transforms later in the chain have been at it already.
 
-    Discrete actions keep the dtype and shape of the environment. The zeros of the first step are
-    then no valid one-hot code, or the index of action 0: `one_hot=True` tells them apart.
+    Discrete actions keep dtype and shape. The zeros of the first step are then no valid one-hot
+    code, or the index of action 0: `one_hot=True` tells them apart.
 
     Args:
         in_keys: actions, shape `(*batch, action)`. Default `"action"`.
@@ -65,8 +63,6 @@ class PreviousAction(EnvironmentTransform):
         # What travels from the way in to the way out, where earlier action transforms have
         # overwritten the action: one entry per action, never seen outside a step.
         self._chosen = [sibling_key(key, "_chosen_{}") for key in inputs]
-        # specs are slow to ask and short episodes reset often
-        self._leaves: dict[NestedKey, TensorSpec] = {}
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = super()._inv_call(tensordict)
@@ -82,16 +78,17 @@ class PreviousAction(EnvironmentTransform):
             if action is None:
                 action = read_leaf(tensordict, key, self)
             if self.one_hot:
-                leaf = self._leaf(key)
-                codes = torch.arange(leaf.shape[-1], device=action.device)
-                action = (action.unsqueeze(-1) == codes).to(leaf.dtype)
+                shape, _, dtype = self._layout(key)
+                codes = torch.arange(shape[-1], device=action.device)
+                action = (action.unsqueeze(-1) == codes).to(dtype)
             next_tensordict.set(out_key, action)
         return next_tensordict
 
     def _reset(self, _: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # every row: the environment keeps the old values of the rows that are not reset
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            tensordict_reset.set(out_key, self._leaf(key).zero())
+            shape, device, dtype = self._layout(key)
+            tensordict_reset.set(out_key, torch.zeros(shape, device=device, dtype=dtype))
         return tensordict_reset
 
     def _reset_on_native_autoreset(
@@ -105,29 +102,25 @@ class PreviousAction(EnvironmentTransform):
         return tensordict_reset
 
     # ------------------------------------------------------------------------------------- specs
-    def _leaf(self, key: NestedKey) -> TensorSpec:
-        """Return the spec of the previous action, which is zero after a reset: no action's own."""
-        if key in self._leaves:
-            return self._leaves[key]
+    def _layout(self, key: NestedKey) -> tuple[tuple[int, ...], torch.device, torch.dtype]:
+        """Return shape, device and dtype of the previous action."""
         leaf = read_leaf(self.parent.full_action_spec, key, self)
-        if self.one_hot:
-            if type(leaf) is not Categorical:
-                raise ValueError(
-                    f"`one_hot` needs an index action (Categorical), got {type(leaf).__name__} "
-                    f"under {key!r}, which needs no coding. Leave one_hot=False."
-                )
-            made: TensorSpec = Unbounded(shape=(*leaf.shape, leaf.n), device=leaf.device)
-        else:
-            made = mask_like(leaf) if leaf.dtype is torch.bool else unbounded_like(leaf)
-        return self._leaves.setdefault(key, made)
+        if not self.one_hot:
+            return leaf.shape, leaf.device, leaf.dtype
+        if type(leaf) is not Categorical:
+            raise ValueError(
+                f"`one_hot` needs an index action (Categorical), got {type(leaf).__name__} "
+                f"under {key!r}, which needs no coding. Leave one_hot=False."
+            )
+        return (*leaf.shape, leaf.n), leaf.device, torch.get_default_dtype()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Enter the previous action, unbounded."""
+        """Enter the previous action, unbounded: after a reset it is zero, no action's own."""
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            observation_spec[out_key] = self._leaf(key).clone()
+            shape, device, dtype = self._layout(key)
+            observation_spec[out_key] = (
+                Binary(shape=shape, device=device, dtype=dtype)
+                if dtype is torch.bool
+                else Unbounded(shape, device, dtype)
+            )
         return observation_spec
-
-    def empty_cache(self) -> None:
-        """Forget what was read from the specs."""
-        super().empty_cache()
-        self._leaves = {}

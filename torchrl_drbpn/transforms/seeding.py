@@ -21,7 +21,7 @@ from torchrl_drbpn.transforms._base import (
 )
 
 _SEED_BITS = 63
-_EXTRA = "_extra_state"
+_NO_STATE = torch.empty(0, dtype=torch.uint8)
 
 
 def check_seed(seed: int, name: str = "seed") -> int:
@@ -70,12 +70,9 @@ class SeededKeys(CorruptionKeys, total=False):
 
 
 class SeededTransform(EnvironmentTransform, CorruptingTransform):
-    """A corrupting transform that draws.
+    """A corrupting transform that draws: with a seed from its own generator, else from torch's.
 
-    With a seed it has a generator of its own on the device of the data: the global one is neither
-    read nor advanced, two classes with the same seed give unrelated sequences, and the state of
-    the generator is part of `state_dict`. Without one it draws from torch's global generator, which
-    `torch.manual_seed` seeds, and `env.set_seed` in the workers of a `ParallelEnv`.
+    Its generator lies on the device of the data, and its state is part of `state_dict`.
     """
 
     why_online = "draws afresh at every call"
@@ -92,7 +89,7 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
         """Start the sequence of `seed`; None draws from torch's global generator."""
         self.seed = None if seed is None else check_seed(seed)
         self._generator: torch.Generator | None = None
-        self._saved_state: Tensor | None = None
+        self._saved_state = _NO_STATE
 
     def generator(self, device: torch.device) -> torch.Generator | None:
         """Return what to draw from on `device`; None is torch's global generator."""
@@ -105,11 +102,11 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
             # golden-ratio steps spread neighbouring seeds, `stream` separates the classes
             mixed = self.seed * 0x9E3779B97F4A7C15 + self.stream * 0xD1B54A32D192ED03
             generator.manual_seed(mixed % (1 << _SEED_BITS))
-            saved, self._saved_state = self._saved_state, None
+            saved, self._saved_state = self._saved_state, _NO_STATE
             size = generator.get_state().numel()
-            if saved is not None and saved.numel() == size:
+            if saved.numel() == size:
                 generator.set_state(saved)
-            elif saved is not None:
+            elif saved.numel():
                 warnings.warn(
                     f"the saved generator state has {saved.numel()} bytes, one on {device} has "
                     f"{size}: it was saved on another kind of device and can't be continued here. "
@@ -122,14 +119,13 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
         """Return seed (-1 for None) and generator state as tensors, for `state_dict`."""
         state = self._saved_state if self._generator is None else self._generator.get_state()
         seed = torch.tensor(-1 if self.seed is None else self.seed)
-        empty = torch.empty(0, dtype=torch.uint8)
-        return {"seed": seed, "generator": empty if state is None else state.clone()}
+        return {"seed": seed, "generator": state.clone()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Continue from what `get_extra_state` returned."""
-        seed, saved = int(state["seed"]), state["generator"].cpu()
+        seed = int(state["seed"])
         self.set_seed(None if seed < 0 else seed)
-        self._saved_state = saved.clone() if saved.numel() else None
+        self._saved_state = state["generator"].cpu().clone()
 
     def clone(self) -> Any:
         """Return a copy without a parent, whose generator runs on by itself from the same state."""
@@ -143,18 +139,16 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
 def seed_env(env: EnvBase, seed: int) -> int | None:
     """Seed `env` and every transform that draws, with a seed of its own for each.
 
-    TorchRL's `env.set_seed` reaches the simulator, and torch's global generator in the workers of a
-    `ParallelEnv`. This also gives every transform that draws a generator of its own, in nested
+    Beside `env.set_seed` this gives every transform that draws a generator of its own, in nested
     `TransformedEnv`s and in the workers of `SerialEnv` and `ParallelEnv`, so that workers see
-    different noise and a seed reproduces everything, whatever else draws. A `mechanism_seed` is
-    left alone.
+    different noise and a seed reproduces everything, whatever else draws.
 
     Not reached: environments wrapped twice or batched inside a worker, and those of collectors that
     run in processes of their own: seed those in the function that builds them.
 
     Args:
         env: the environment; batched ones are started.
-        seed: a TypeError where it is no integer, a ValueError where it is negative.
+        seed: an integer in [0, 2**63).
 
     Returns:
         What `env.set_seed` returns: a seed for the next environment.
@@ -185,12 +179,12 @@ def seed_env(env: EnvBase, seed: int) -> int | None:
         for index in range(env.num_workers):
             state = states[f"worker{index}"]
             for key, value in state.items():
-                *path, last = key.split(".")
-                if last != _EXTRA or not isinstance(value, dict) or "generator" not in value:
+                if not isinstance(value, dict) or "generator" not in value:
                     continue
                 if isinstance(env, ParallelEnv):
                     # It looks up a chain of attributes in its workers. Its load_state_dict would
                     # leave a signal behind that the next step takes for its own.
+                    path = key.split(".")[:-1]
                     reduce(getattr, [*path, "set_seed"], env[index].transform)(draw())
                 else:
                     value |= {"seed": torch.tensor(draw()), "generator": value["generator"][:0]}

@@ -16,21 +16,8 @@ from torchrl_drbpn.transforms._carried import CarriedKeys, CarriedStateTransform
 from torchrl_drbpn.transforms.noise import NUMBERS, STD, Numbers
 
 
-class FaultKeys(CarriedKeys, total=False):
-    """And when faults end."""
-
-    mean_length: float | None
-    duration: int | None
-
-
 class FaultyReadings(CarriedStateTransform):
-    """A transform of readings that are wrong while their sensor has a fault; masks stay.
-
-    Faults begin and end at random (`probability`, `mean_length`) or at a fixed step of every
-    episode (`onset`, 0 for the reset, and `duration`). The first state is an int64 count for each
-    group: how many steps its fault has lasted, this one included; 0 or less while it works. Every
-    group works before an episode begins.
-    """
+    """A transform of readings that are wrong while their sensor has a fault; masks stay."""
 
     role: ClassVar[Role] = "noise"
     writes_mask: ClassVar[bool] = False
@@ -111,10 +98,9 @@ class StuckSensors(FaultyReadings):
         onset: in the place of `probability`: the step of every episode at which sensors get stuck,
             0 or more; at the reset, 0, they show one reading and keep to it.
         duration: in the place of `mean_length`: for how many steps, 1 or more; None: for good.
-        state_keys: where the state is kept: the steps that a fault has lasted, int64 `(*batch,
-            groups)`, 0 or less for a sensor that works, and what each shows, `(*batch, obs)`; by
-            default `stuck_steps` and `stuck_observation` beside the first observation. Evaluations
-            can look; no policy should read it.
+        state_keys: the steps that a fault has lasted, this one included, int64 `(*batch, groups)`,
+            0 or less for a sensor that works, and what each shows, `(*batch, obs)`; by default
+            `stuck_steps` and `stuck_observation` beside the first observation.
         **keys: `groups` as in `SensorOutages`; what is in none never gets stuck. `seed`, `in_keys`,
             `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
@@ -129,17 +115,17 @@ class StuckSensors(FaultyReadings):
     stream: ClassVar[int] = 7
     state_names: ClassVar[tuple[str, ...]] = ("stuck_steps", "stuck_observation")
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         steps, faulty, last = self._faulty(step)
         shown = step.observation
         if last is None:
             # the state never holds what a mask hides
-            last = shown if step.observed is None else zero_missing(shown, step.observed)
+            last = zero_missing(shown, step.observed)
         else:
             shown = torch.where(faulty, last, shown)
-            last = shown if step.observed is None else torch.where(step.observed, shown, last)
-        self._carry(step, steps, last.clone())
-        return shown.clone(), None
+            last = torch.where(step.observed, shown, last)
+        self._carry(step, steps, last)
+        return shown, step.observed
 
 
 class SensorDrift(FaultyReadings):
@@ -148,11 +134,10 @@ class SensorDrift(FaultyReadings):
     $\tilde x_t = x_t + b_t, \quad b_t = b_{t-1} + \text{rate} + \text{walk\_std}\, \epsilon_t,
     \quad \epsilon_t \sim N(0, 1)$
 
-    for every entry of a sensor that drifts, and $b_t = 0$ for one that does not: at the reset it
-    starts anew, and a sensor that recovers is calibrated again. After n steps of drift the bias has
-    mean n rate and standard deviation sqrt(n) walk_std. By default every sensor drifts from the
-    reset on, which counts as the first step; with `onset` from that step on; with `probability`
-    drifts begin and end at random as the faults of `StuckSensors` do.
+    for every entry of a sensor that drifts, and $b_t = 0$ for one that does not: after n steps of
+    drift the bias has mean n rate and standard deviation sqrt(n) walk_std. By default every sensor
+    drifts from the reset on, which counts as the first step; with `onset` from that step on; with
+    `probability` drifts begin and end at random as the faults of `StuckSensors` do.
 
     A drifting reading arrives: its mask stays True. Entries that a mask hides stay 0 while the bias
     goes on growing.
@@ -166,12 +151,11 @@ class SensorDrift(FaultyReadings):
         probability: that a sensor begins to drift at a step, in [0, 1]; None, the default: `onset`.
         onset: the step of every episode at which sensors begin to drift; None, the default, is 0,
             the reset, where there is no `probability`.
-        **keys: `mean_length`, `duration` as in `StuckSensors`; `groups` as in `SensorOutages`, each
-            component with a bias of its own, what is in none never drifts; `state_keys` of the
-            steps that a sensor has drifted, int64 `(*batch, groups)`, 0 or less for one that does
-            not, and of the bias, `(*batch, obs)`, by default `drift_steps` and `drift_bias` beside
-            the first observation; `seed`, `in_keys`, `mask_keys`, `complete_key` as in
-            `ObservationMissingness`.
+        mean_length: with `probability`, and `duration` with `onset`, as in `StuckSensors`.
+        **keys: `groups` as in `SensorOutages`, each component with a bias of its own, what is in
+            none never drifts; `state_keys` of the steps of drift, as in `StuckSensors`, and of the
+            bias, `(*batch, obs)`, by default `drift_steps` and `drift_bias`; `seed`, `in_keys`,
+            `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Example:
         >>> from tensordict import TensorDict
@@ -191,21 +175,23 @@ class SensorDrift(FaultyReadings):
         rate: Numbers = 0.0,
         *,
         probability: float | None = None,
+        mean_length: float | None = None,
         onset: int | None = None,
-        **keys: Unpack[FaultKeys],
+        duration: int | None = None,
+        **keys: Unpack[CarriedKeys],
     ) -> None:
         if probability is None and onset is None:
             onset = 0
-        super().__init__(probability, onset=onset, **keys)
+        super().__init__(probability, mean_length, onset=onset, duration=duration, **keys)
         self.walk_std = read_numbers(walk_std, "walk_std", STD)
         meaning = f"{NUMBERS}, finite, in observation units"
         self.rate = read_numbers(rate, "rate", meaning, least=-math.inf)
 
-    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor | None]:
+    def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x = step.observation
         steps, faulty, bias = self._faulty(step)
         growth = sample_noise(self.walk_std.to(x), x, self.generator(x.device)) + self.rate.to(x)
         grown = growth if bias is None else bias + growth
         bias = grown.masked_fill(~faulty, 0.0)
         self._carry(step, steps, bias)
-        return x + bias, None
+        return x + bias, step.observed
