@@ -267,7 +267,9 @@ class SimulatorBatch(EnvBase):
 
     def extra_repr(self) -> str:
         """Name task, number of environments, device and dtype."""
-        return f"{self.env_id!r}, num_envs={self.num_envs}, device={self.device}, dtype={self.dtype}"
+        return (
+            f"{self.env_id!r}, num_envs={self.num_envs}, device={self.device}, dtype={self.dtype}"
+        )
 
 
 def one_line(thing: object) -> str:

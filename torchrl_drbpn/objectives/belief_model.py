@@ -12,8 +12,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS, LossModule
 
-__all__ = ["BeliefModelLoss"]
-
 
 class BeliefModelLoss(LossModule):
     r"""Minus the log-likelihood of every observation that arrived, each counted once.
@@ -26,10 +24,8 @@ class BeliefModelLoss(LossModule):
 
     It holds no network: a belief module has written ``("belief", "log_likelihood")`` before.
     Every step counts with its own observation, and those of :meth:`last_steps` with the next one
-    too if ``("next", "belief", "log_likelihood")`` is there (:class:`DRBPNLoss` writes it).
-
-    As in TorchRL's losses ``done`` and ``terminated`` are read inside "next". The next mask and the
-    next likelihood have the names of the step's own.
+    too if ``("next", "belief", "log_likelihood")`` is there (:class:`DRBPNLoss` writes it). As in
+    TorchRL's losses ``done`` and ``terminated`` are read inside "next".
 
     Keyword Args:
         normalize: "entry" divides by the number of observed entries, "step" by steps.
@@ -130,31 +126,19 @@ class BeliefModelLoss(LossModule):
         ``final`` before such data are stored.
 
         Args:
-            tensordict: rollout data, batch size ``(*batch, time)``.
-
-        Returns:
-            Bool, shape ``(*batch, time)``.
+            tensordict: rollout data, of whose batch size ``(*batch, time)`` the result is, bool.
         """
         keys, shape = self.tensor_keys, tensordict.shape
-        terminated, done, final = (
-            tensordict.get(key, None)
-            for key in (in_next(keys.terminated), in_next(keys.done), keys.final)
-        )
-        device = tensordict.get(keys.observed).device
-        last = torch.zeros(shape, dtype=torch.bool, device=device)
-        for flag in (terminated, final):
-            if flag is not None:
-                last = last | flag.reshape(shape)
-        if done is not None:
-            index = tensordict.get("index", None)
-            done = done.reshape(shape)
-            if index is not None and shape:
-                # Where each step was stored. Of rows that were stored whole it is constant in time.
-                index = index.reshape(*shape, -1)
-                moves = index[..., 1:, :] != index[..., :-1, :]
-                done = done & ~moves.any(-1).any(-1, keepdim=True)
-            last = last | done
-        return last
+        none = torch.zeros(shape, dtype=torch.bool, device=tensordict.get(keys.observed).device)
+        flags = (in_next(keys.terminated), keys.final, in_next(keys.done))
+        terminated, final, done = (tensordict.get(key, none).reshape(shape) for key in flags)
+        index = tensordict.get("index", None)
+        if index is not None and shape:
+            # Where each step was stored. Of rows that were stored whole it is constant in time.
+            index = index.reshape(*shape, -1)
+            moves = index[..., 1:, :] != index[..., :-1, :]
+            done = done & ~moves.any(-1).any(-1, keepdim=True)
+        return terminated | final | done
 
     def _read(self, tensordict: TensorDictBase, *keys: NestedKey) -> list[Tensor]:
         found = [tensordict.get(key, None) for key in keys]

@@ -22,21 +22,15 @@ from torchrl.objectives.utils import (
 
 from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, in_next
 
-__all__ = ["DRBPNLoss"]
-
 
 def _held(name: str) -> Any:
-    """Pass a coefficient on to the held PPO loss, as a number or a tensor, in place."""
+    """Pass a coefficient on to the held PPO loss, which copies a number into its buffer."""
 
     def read(self: DRBPNLoss) -> Any:
         return getattr(self.ppo_loss, name)
 
     def write(self: DRBPNLoss, value: Any) -> None:
-        buffer = read(self)
-        if isinstance(buffer, Tensor):
-            buffer.copy_(torch.as_tensor(value))
-        else:
-            setattr(self.ppo_loss, name, value)
+        setattr(self.ppo_loss, name, value.item() if isinstance(value, Tensor) else value)
 
     return property(read, write, doc=f"``{name}`` of the held PPO loss.")
 
@@ -46,10 +40,8 @@ class DRBPNLoss(LossModule):
 
     .. math:: L = L^{objective} + \lambda_v L^{critic} + \lambda_m L^{model}
 
-    Eq. (13) [DRBPN]: one pass, and all gradients reach the filter. The two losses are held, not
-    subclassed; the actor and the critic of ``ppo_loss`` are heads that read what the belief
-    module writes (``features``). ``loss_model`` comes out weighted by ``model_coeff``, as
-    ``loss_critic`` does by its coefficient, so the sum of all ``loss_*`` is the total.
+    Eq. (13) [DRBPN]: one pass, and all gradients reach the filter. ``loss_model`` comes out
+    weighted by ``model_coeff``, so the sum of all ``loss_*`` is the total.
 
     The input is a batch of sequences, ``[*batch, time]``, cut from rollouts, with the recurrent
     state that the collector stored. Where no other step holds the next observation
@@ -60,7 +52,8 @@ class DRBPNLoss(LossModule):
 
     Args:
         filter_module: a belief module, such as :class:`~torchrl_drbpn.BeliefFilterModule`.
-        ppo_loss: TorchRL's ClipPPOLoss over heads. The belief module is functionalised if it is.
+        ppo_loss: TorchRL's ClipPPOLoss over heads, actor and critic, that read what the belief
+            module writes (``features``). The belief module is functionalised if it is.
         model_loss: the model loss, None for belief modules without a likelihood.
 
     Keyword Args:
@@ -158,9 +151,6 @@ class DRBPNLoss(LossModule):
         Args:
             kwargs: names of ``_AcceptedKeys`` and their new keys; None restores the default. The
                 reward and the flags are looked for inside "next", with or without that word.
-
-        Raises:
-            ValueError: for an unknown name.
         """
         mine = sorted(field.name for field in fields(self._AcceptedKeys))
         unknown = sorted(set(kwargs) - set(mine))
@@ -242,15 +232,7 @@ class DRBPNLoss(LossModule):
     def make_value_estimator(
         self, value_type: ValueEstimators | None = None, **hyperparams: Any
     ) -> DRBPNLoss:
-        """Build the estimator of advantages, over ``critic_network``.
-
-        Args:
-            value_type: as in TorchRL's losses; GAE by default.
-            hyperparams: of the estimator.
-
-        Returns:
-            The loss.
-        """
+        """Build TorchRL's estimator of advantages, GAE by default, over ``critic_network``."""
         value_type = value_type or self.default_value_estimator
         if not isinstance(value_type, ValueEstimators):
             super().make_value_estimator(value_type, **hyperparams)
