@@ -24,15 +24,12 @@ def nis(innovation: Tensor, innovation_cov: Tensor, observed: Tensor) -> Tensor:
 
     §5.4 [Bar-Shalom 2001]. If the belief is right it is chi-square distributed with as many
     degrees of freedom as entries were observed, which is then its mean. Larger: too sure.
-    Smaller: not sure enough.
+    Smaller: not sure enough. No unit, ``(*batch,)``, float64; exactly 0 where nothing was observed.
 
     Args:
         innovation: v of :func:`innovation`, shape ``(*batch, obs)``.
         innovation_cov: S over all entries, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
         observed: bool M, shape ``(*batch, obs)``, True = counts; a ValueError for another.
-
-    Returns:
-        Shape ``(*batch,)``, no unit, float64; exactly 0 where nothing was observed.
 
     Example:
         >>> v, S = torch.tensor([3.0, float("nan")]), torch.diag(torch.tensor([9.0, 1.0]))
@@ -109,16 +106,13 @@ def consistency(
 
     The time-average test of §5.4.2 [Bar-Shalom 2001]. The band holds for independent terms: the
     innovations of a right filter are, the NEES of successive steps is not (average it over runs at
-    one step).
+    one step). Ratio and band are float64, NaN where no entry was observed.
 
     Args:
         squared: :func:`nis` or :func:`nees` of every step.
         dof: n, the entries of every step, the same shape; steps with none do not count.
         probability: of the two-sided band, 1 - alpha, in (0, 1).
         dim: dimension that is summed over; None: all of them.
-
-    Returns:
-        Ratio and band, float64, without that dimension; NaN where no entry was observed.
 
     Example:
         >>> squared = torch.distributions.Chi2(3.0).sample((4000,))

@@ -68,8 +68,6 @@ def filter_step(
         >>> out = filter_step(model, mean, action, mean, nothing, nothing[:, 0])
         >>> torch.allclose(out.mean, model.transition(mean, action), atol=1e-5)
         True
-        >>> bool((out.log_likelihood == 0).all())
-        True
     """
     given = FilterInputs(
         observation, observed, previous_action, reset, None, None, mean, None, cov, weight
@@ -126,9 +124,6 @@ def filter_sequence(
             on the diagonal of R; 0 is missing. It gets no gradient.
         return_cov: whether the filtered covariances are wanted, with their gradient.
         form: "auto" runs the native form where it can; "pytorch" and "native" force one.
-
-    Returns:
-        :class:`FilterOutput` of shapes ``(*batch, time, ...)``.
 
     Raises:
         ValueError: for a wrong shape or dtype, a weight outside [0, 1], a belief that is not whole,

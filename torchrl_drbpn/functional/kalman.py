@@ -74,13 +74,9 @@ def predict(
         jacobian: J, the derivative of f by the mean, shape ``(*batch, state, state)``; None for the
             constant covariance of the paper, which drops the past.
 
-    Returns:
-        The predicted belief.
-
     Example:
-        >>> belief = Belief(torch.ones(5, 2), torch.eye(2).expand(5, 2, 2))
-        >>> predicted = predict(
-        ...     belief, lambda m, a: m + a, 0.1 * torch.eye(2), torch.ones(5, 2), jacobian=None)
+        >>> belief, eye = Belief(torch.ones(5, 2), torch.eye(2).expand(5, 2, 2)), torch.eye(2)
+        >>> predicted = predict(belief, lambda m, a: m + a, eye, torch.ones(5, 2), jacobian=None)
         >>> bool((predicted.mean == 2).all()), predicted.cov.shape
         (True, torch.Size([5, 2, 2]))
     """
@@ -128,9 +124,8 @@ def innovation(
         offset: o = B a + d, shape ``(*batch, obs)``; None is 0.
 
     Returns:
-        ``Belief(v, S)``, float64 whatever the dtype of the belief: with R at its floor beside a
-        large P, S has a condition number of 1e6 and more. v ``(*batch, obs)``, 0 at missing
-        entries; S ``(*batch, obs, obs)`` over all components, observed or not.
+        ``Belief(v, S)``, float64: with R at its floor S has a condition number of 1e6 and more.
+        v is 0 at missing entries; S is over all components, observed or not.
 
     Example:
         >>> belief, seen = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([True, False])
@@ -207,10 +202,8 @@ def sequential_update(
         s_i = h_i' P h_i + r_i, \quad k_i = P h_i / s_i, \quad
         m \leftarrow m + k_i (x_i - h_i' m), \quad P \leftarrow P - k_i h_i' P
 
-    The result is that of :func:`update` where R is diagonal [Anderson and Moore 1979]. Nothing is
-    factorised: what has no Cholesky decomposition, such as ONNX, can run it.
-
-    Arguments are those of :func:`innovation`, R diagonal; it returns the filtered belief.
+    Arguments and result are those of :func:`update`, R diagonal [Anderson and Moore 1979]. Nothing
+    is factorised: what has no Cholesky decomposition, such as ONNX, can run it.
 
     Example:
         >>> belief, H = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
@@ -273,11 +266,9 @@ def update_by_mask(
     taken for a reading :math:`\mu + g / h` of variance :math:`1 / h - v` on top of R. For one
     missing entry mean and covariance are exact; several are matched from the same belief, once.
 
-    Arguments are those of :func:`innovation` with the filtered belief, and the ``mask_model``.
-
-    Returns:
-        The belief, and the log-probability of the mask, nats, shape ``(*batch,)``: entries that
-        are missing together are counted as independent.
+    Arguments are those of :func:`innovation` with the filtered belief, and the ``mask_model``. It
+    returns the belief, and the log-probability of the mask, nats, shape ``(*batch,)``: entries that
+    are missing together are counted as independent.
 
     Example:
         >>> belief, zero = Belief(torch.zeros(1), torch.eye(1)), torch.zeros(1)

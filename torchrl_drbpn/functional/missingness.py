@@ -44,14 +44,11 @@ def draw_mechanism(
     always_observed: float = 0.25,
     generator: torch.Generator | None,
 ) -> MissingnessMechanism:
-    """Draw the always observed entries and b0, b1, b2 ~ N(0, 1) of a mechanism.
+    """Draw the always observed entries and b0, b1, b2 ~ N(0, 1) of a mechanism, float64 on the CPU.
 
     round(always_observed * obs_dim) entries always arrive, at least 1; a ValueError where that is
     all of them. MAR and NMAR draw the same numbers from the same CPU generator, and the action's
     weights come last, so that all else does not depend on `action_dim`, which may be 0.
-
-    Returns:
-        The mechanism, float64 on the CPU.
 
     Example:
         >>> draw = lambda: draw_mechanism("mar", 8, 3, generator=torch.Generator().manual_seed(0))
@@ -87,7 +84,7 @@ def missing_probability(
     previous_action: Tensor | None,
     eta: float,
 ) -> Tensor:
-    r"""Return the probability that each entry goes missing.
+    r"""Return the probability that each entry goes missing, `(*batch, obs)`.
 
     $P(\text{missing}_i) = \min(\sigma(b_{1i}^\top a_{t-1} + b_{2i}^\top x + b_{0i}), \eta)$, and 0
     for the always observed entries (experiments of [DRBPN]). It realises clearly less than eta.
@@ -97,9 +94,6 @@ def missing_probability(
         observation: complete, noise included, shape `(*batch, obs)`.
         previous_action: a_{t-1}, shape `(*batch, action)`; None counts as zero.
         eta: upper bound of the probability.
-
-    Returns:
-        Probabilities, shape `(*batch, obs)`.
 
     Example:
         >>> m = draw_mechanism("nmar", 4, 2, generator=torch.Generator().manual_seed(0))

@@ -205,18 +205,9 @@ def particle_step(
         + \log p(x_t^{obs} \mid h', z, a_{t-1})
 
     Algorithm 1 [DVRL 2018]; differs from it in the last term, which counts the entries that
-    arrived. With nothing observed the weight is p / q alone.
-
-    Args:
-        model: the distributions.
-        hidden: h of the step before, shape ``(*batch, particles, hidden)``.
-        log_weight: of the step before, shape ``(*batch, particles)``, nats; zeros at a start.
-        inputs: of this step, for the model.
-        observation: shape ``(*batch, obs)``; missing entries may hold anything.
-        observed: bool, shape ``(*batch, obs)``, True = arrived.
-        noise: of this step.
-
-    See also :func:`particle_sequence`, whose example has a model.
+    arrived. With nothing observed the weight is p / q alone. ``hidden`` and ``log_weight`` are in
+    the :class:`ParticleOutput` of the step before, zeros at a start; ``observation`` and the bool
+    ``observed``, True = arrived, are ``(*batch, obs)``. :func:`particle_sequence` has an example.
     """
     hidden = resample(hidden, systematic_ancestors(log_weight, noise.resampling))
     proposal, transition = model.propose(hidden, inputs)

@@ -144,10 +144,7 @@ def robust_sequence_weights(
     """Weigh the readings of a sequence, step by step: each from the belief that the last one left.
 
     Arguments are those of :func:`filter_sequence`, and ``robust``, "huber" or "imq", with its
-    ``threshold`` c, standard deviations.
-
-    Returns:
-        Weights for :func:`filter_sequence`, shape ``(*batch, time, obs)``, without gradient.
+    ``threshold`` c, standard deviations. The weights are its ``weight``, without gradient.
 
     Raises:
         ValueError: for a wrong shape or dtype, another ``robust``, a ``threshold`` that is not

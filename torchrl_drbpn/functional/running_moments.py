@@ -41,17 +41,11 @@ class RunningMoments(NamedTuple):
 
 
 def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMoments:
-    """Compute the moments of the observed entries of a batch.
+    """Compute the moments of the observed entries of a batch, float64; of no entry they are 0.
 
     With `o` the mask: n = sum o,  mean = sum o x / n,  var = sum o (x - mean)^2 / n, each over the
-    first dimension. What lies under a False entry is never used, NaN and infinity included.
-
-    Args:
-        value: the samples, shape ``(samples, *event)``.
-        observed: bool of that shape, True = arrived; a ValueError for another. None: all.
-
-    Returns:
-        The moments, in float64; all 0 where nothing was observed.
+    first dimension of a value ``(samples, *event)``. ``observed`` is bool of that shape, a
+    ValueError for another; None: all. What lies under a False entry, NaN included, is never used.
 
     Example:
         >>> x = torch.tensor([[1.0], [3.0], [torch.nan]])
@@ -71,14 +65,12 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMome
 
 
 def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMoments:
-    r"""Merge the moments of two batches into those of both together.
+    """Merge the moments of two batches into those of both together.
 
     With d = mean_b - mean_a and w = n_b / (n_a + n_b):
     mean = mean_a + w d,  var = (1 - w) var_a + w var_b + w (1 - w) d^2.
     Eq. (1.5) of [Chan, Golub, LeVeque 1979, Updating formulae and a pairwise algorithm for
-    computing sample variances], divided by the count.
-
-    Both have one shape ``(*event)``, or a ValueError is raised; neither is changed.
+    computing sample variances], divided by the count. A ValueError for different shapes.
 
     Example:
         >>> x = torch.randn(9, 2, dtype=torch.float64)
@@ -120,20 +112,14 @@ def winsorize(
 ) -> tuple[Tensor, Tensor]:
     """Clip outliers to a bound, so that one reading cannot dominate the statistics.
 
-    A component with 100 learned readings and a variance above ``eps`` is clipped to its learned
-    mean plus and minus 10 learned deviations: a scale that really grows can grow tenfold with each
-    batch. Before that the batch sets the bound: its median plus and minus 5 times a deviation that
-    only one in a thousand readings, and at least one, exceeds. Of fewer than three readings
-    nothing is learned, as an outlier among them could not be recognised.
+    A component with 100 learned readings and a variance above ``eps``, squared units, is clipped
+    to its learned mean plus and minus 10 learned deviations: a scale that really grows can grow
+    tenfold with each batch. Before that the batch sets the bound: its median plus and minus 5 times
+    a deviation that only one in a thousand readings, and at least one, exceeds. Of fewer than three
+    readings nothing is learned, as an outlier among them could not be recognised.
 
-    Args:
-        value: readings, shape ``(samples, *event)``, finite where observed.
-        observed: bool of that shape.
-        learned: the moments so far.
-        eps: variance from which a component counts as one that moves, squared units.
-
-    Returns:
-        The readings, float64, and which of them to learn from.
+    Of readings ``(samples, *event)``, finite where the bool ``observed`` is True, and the moments
+    learned so far it returns the readings, float64, and which of them to learn from.
 
     Example:
         >>> nothing = RunningMoments(*torch.zeros(3, 1, dtype=torch.float64))

@@ -55,15 +55,12 @@ def smooth_sequence(
     with :math:`P^-_{t+1} = F_{t+1} P_t F_{t+1}' + Q`: the Rauch-Tung-Striebel smoother, §8.2
     [Särkkä 2013], extended by the Jacobian F (§9.1) where f is not linear. The covariance is
     computed as :math:`(I - G F) P (I - G F)' + G (P^s + Q) G'`, equal and always positive definite.
-    Nothing passes an episode start. In float64 but for the transition.
+    Nothing passes an episode start. In float64 but for the transition; differentiable.
 
     Arguments are those of :func:`filter_sequence`, but for these: ``cov`` None is 0, so that the
     first predicted covariance is Q. ``jacobian`` is F, ``(state, state)``, or a function of (mean,
     action); None: the model's, and where it has none that of the transition at the filtered mean of
     every row. ``emission_cov`` is R of every step, ``(*batch, time, obs, obs)``; None: the model's.
-
-    Returns:
-        Smoothed beliefs, shapes ``(*batch, time, ...)``; differentiable.
 
     Raises:
         ValueError: for a wrong shape or dtype, or a covariance that is not positive definite.
@@ -114,13 +111,14 @@ def forecast(
     *,
     jacobian: Jacobian | None = None,
 ) -> Forecast:
-    r"""Predict the steps ahead, of which nothing was read.
+    r"""Predict the steps ahead, of which nothing was read; differentiable.
 
     .. math::
         m_{j} = f(m_{j-1}, a_{j}), \quad P_{j} = F_{j} P_{j-1} F_{j}' + Q, \qquad
         x_j \sim N(H m_j + B a_j + d,\; H P_j H' + R)
 
-    §4.1 [Särkkä 2013], extended by the Jacobian (§5.2) where f is not linear.
+    §4.1 [Särkkä 2013], extended by the Jacobian (§5.2) where f is not linear. A ValueError for a
+    wrong shape or dtype.
 
     Args:
         model: the state-space model.
@@ -128,15 +126,7 @@ def forecast(
         cov: its covariance, shape ``(*batch, state, state)``; None: 0, so that the first predicted
             covariance is Q, as the filter with a constant covariance has it.
         action: the actions ahead, ``(*batch, ahead, action)``; entry j leads to step j.
-
-    Keyword Args:
         jacobian: see :func:`smooth_sequence`.
-
-    Returns:
-        :class:`Forecast`; differentiable.
-
-    Raises:
-        ValueError: for a wrong shape or dtype.
 
     Example:
         >>> from torchrl_drbpn import BeliefFilter

@@ -61,9 +61,7 @@ class TransitionMLP(NamedTuple):
             \frac1N \sum_r W_3 D_r^2 W_2 D_r^1 W_1
             = W_3 \left(\tfrac1N d_2' d_1 \circ W_2\right) W_1
 
-        :math:`D_r^i` is the diagonal of the activation's derivatives :math:`d_i`, shape
-        ``(N, width)``; of :math:`W_1` the columns of the mean count.
-
+        :math:`D_r^i` is the diagonal of the activation's derivatives :math:`d_i`, ``(N, width)``.
         Shape ``(*batch, state, state)``, or ``(state, state)`` of the average.
         """
         state = mean.shape[-1]
@@ -335,18 +333,7 @@ def predict_step(
 
     Eq. (8) [DRBPN]; differs from the paper: with a ``transition_jacobian`` F the covariance is
     propagated, as in the extended Kalman filter (§5.2 [Särkkä 2013]). F and the covariance before
-    are constants of autograd.
-
-    Args:
-        model: the state-space model.
-        mean: filtered mean of the step before, shape ``(*batch, state)``.
-        previous_action: shape ``(*batch, action)``.
-        reset: bool, shape ``(*batch,)``.
-        cov: filtered covariance of the step before, shape ``(*batch, state, state)``; read where
-            it is propagated.
-
-    Returns:
-        The predicted belief.
+    are constants of autograd. Arguments are those of :func:`filter_step`.
 
     Example:
         >>> from torchrl_drbpn import BeliefFilter

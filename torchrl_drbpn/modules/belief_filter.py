@@ -48,9 +48,8 @@ class BeliefFilter(nn.Module):
         S = H P H' + R; \quad K = P H' M' (M S M')^{-1} M; \quad
         m^+ = m^- + K (x - H m^- - B a - d)
 
-    Eq. (8), (10), (12) [DRBPN]. M selects the entries that arrived, so any subset of the sensors
-    may be missing at any step. At the first step of an episode the predicted belief is a learned
-    one, N(initial_mean, initial_cov).
+    Eq. (8), (10), (12) [DRBPN]. M selects the entries that arrived. At the first step of an episode
+    the predicted belief is a learned one, N(initial_mean, initial_cov).
 
     Args:
         obs_dim, action_dim: components of an observation, of an action.
@@ -65,21 +64,20 @@ class BeliefFilter(nn.Module):
         covariance: "constant": the predicted covariance is Q whatever came before (eq. 8);
             "propagated": it is F cov F' + Q, with F the derivative of the transition, so that it
             grows while nothing arrives. Train as you act: each kind learns a Q of its own.
-        jacobian: what F is: "mean", the buffer ``mean_jacobian``, which
-            :meth:`refresh_jacobian` sets (the first call of a fresh filter does, at initial_mean),
-            so that all steps of a batch are filtered at once; "row", the derivative at each
-            belief, step by step.
+        jacobian: what F is: "mean", the buffer that :meth:`refresh_jacobian` sets (the first call
+            of a fresh filter does, at initial_mean), so that all steps of a batch are filtered at
+            once; "row", the derivative at each belief, step by step.
         robust: "huber" or "imq" gives a reading that contradicts the prediction and the other
             readings a weight under 1 (:func:`~torchrl_drbpn.functional.innovation_weights`), in
             acting and in training alike; None, as a ``mask_model`` needs it, believes every
             reading. May be set later.
         robust_threshold: standard deviations off at which the weights begin to fall.
-        mask_model: whether to learn :class:`~torchrl_drbpn.functional.MaskModel` too: entries are
-            missing for a reason. The likelihood is then that of readings and mask, the belief
-            learns from what did not arrive, and the filter runs step by step.
-        validate: look at values too, not only at shapes: a NaN or inf that the mask calls
-            observed raises ValueError. Needs a value on the host, so it is skipped while
-            compiling or exporting; switch it off under ``vmap``.
+        mask_model: whether to learn :class:`~torchrl_drbpn.functional.MaskModel` too: the
+            likelihood is then that of readings and mask, the belief learns from what did not
+            arrive, and the filter runs step by step.
+        validate: look at values too: a NaN or inf that the mask calls observed raises ValueError.
+            Needs a value on the host, so it is skipped while compiling or exporting; switch it off
+            under ``vmap``.
         device, dtype: of the parameters.
 
     Raises:

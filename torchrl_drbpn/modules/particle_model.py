@@ -158,20 +158,12 @@ class ParticleFilter(nn.Module):
         observed: Tensor,
         noise: ParticleNoise,
     ) -> ParticleOutput:
-        """Filter sequences, with ``time`` behind the batch.
+        """Filter sequences: :func:`~torchrl_drbpn.functional.particle_sequence` of the networks.
 
-        Args:
-            hidden: h of the step before each step, shape ``(*batch, time, particles, hidden)``;
-                read at the first step and where ``begin`` says so. Zeros start an episode.
-            log_weight: the same of the weights, shape ``(*batch, time, particles)``, nats.
-            begin: bool, shape ``(*batch, time)``.
-            previous_action: shape ``(*batch, time, action)``.
-            observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
-            observed: bool, shape ``(*batch, time, obs)``, True = arrived.
-            noise: see :meth:`noise`.
-
-        Raises:
-            ValueError: for a mask of another shape, or values that are not finite.
+        ``hidden`` and ``log_weight`` are read at the first step and where ``begin`` says so; zeros
+        start an episode. ``observation``, ``observed``, True = arrived, and ``previous_action`` are
+        ``(*batch, time, n)``; for ``noise`` see :meth:`noise`. A ValueError for a mask of another
+        shape, or values that are not finite.
         """
         check_observed(observation, observed)
         zeroed = zero_missing(observation, observed)

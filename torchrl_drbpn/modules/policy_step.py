@@ -143,13 +143,9 @@ class PolicyStep(nn.Module):
 
         Returns:
             the action within its limits ``(*batch, action)``; the next ``mean`` and ``age``; the
-            action as it was chosen, which is the next ``previous_action``, since that is what the
-            belief was trained on; how many readings were called observed and were no finite
-            number, int64 ``(*batch, 1)``; the next ``cov``, where it is propagated.
-
-        Raises:
-            ValueError: for another shape, a ``cov`` that is missing, or a mask or ``is_init`` that
-                is not bool.
+            action as it was chosen, which is the next ``previous_action``; how many readings were
+            called observed and were no finite number, int64 ``(*batch, 1)``; the next ``cov``,
+            where it is propagated. A ValueError for another shape or a mask that is not bool.
         """
         filter, batch = self.filter, observation.shape[:-1]
         for name, value, width in (
