@@ -69,7 +69,7 @@ def test_a_network_q_depends_on_mean_and_action_and_a_free_one_does_not(cov_netw
     q = transition(mean, action).cov
     for changed in ((mean + 1, action), (mean, action + 1)):
         assert torch.equal(transition(*changed).cov, q) is not cov_network
-    assert transition.constant_cov is not cov_network
+    assert (transition.noise is None) is cov_network
 
 
 @pytest.mark.parametrize("residual", [False, True])

@@ -4,8 +4,6 @@ r"""Is a Gaussian belief as sure as it should be: normalised squared errors and 
 Navigation*.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

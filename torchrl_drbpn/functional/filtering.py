@@ -5,8 +5,6 @@
 model of the mask, is filtered step by step.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Gaussian beliefs: the pair (mean, cov), the masked log-density, covariance parametrisations."""
 
-from __future__ import annotations
-
 import math
 from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple

@@ -6,8 +6,6 @@ emission covariance, S the innovation covariance, K the gain. A covariance is a 
 ``(n,)``, the variances of a diagonal one.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

@@ -7,8 +7,6 @@ go missing, completely at random (MCAR), at random given what always arrives (MA
 noise are read, and a generator on its device; None is torch's global one.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal, NamedTuple
 

@@ -6,8 +6,6 @@ time between the operations of the filter, not in them; ``csrc/filter.h`` holds 
 pointer; FakeTensors, tracing and vmap meet an ordinary operator.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import itertools

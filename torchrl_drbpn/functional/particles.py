@@ -6,8 +6,6 @@ deterministic memory h and a stochastic latent z. No random number is drawn here
 step is an argument. k counts particles, K is their number, q the proposal, p the model.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, Protocol
 

@@ -6,8 +6,6 @@ or the precision, state x state. Everything is float64 but the transition: with 
 float32 loses most digits of a gain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

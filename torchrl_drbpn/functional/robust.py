@@ -1,7 +1,5 @@
 """Weights of readings that contradict the belief and the other readings: a robust Kalman update."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal, get_args
 

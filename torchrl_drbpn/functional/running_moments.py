@@ -4,8 +4,6 @@ Only entries that were observed count, so every component has a count of its own
 by the pairwise rule, which loses no precision where the mean is large beside the spread.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

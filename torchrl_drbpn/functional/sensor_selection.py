@@ -1,7 +1,5 @@
 """Choose sensors: the components whose readings leave the belief least uncertain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from numbers import Integral
 from typing import Literal, NamedTuple

@@ -5,8 +5,6 @@ does. A Q that was trained without propagation holds the share of the past alrea
 covariances too wide: train with ``covariance="propagated"`` for these.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import Belief, as_matrix, factorise, without_autocast
-from torchrl_drbpn.functional.kalman import predict, update, update_by_mask
+from torchrl_drbpn.functional.kalman import update, update_by_mask
 from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, TransitionMLP
 
 # F, shape (state, state), or a function of (mean, action) that returns (*batch, state, state).
@@ -74,23 +72,20 @@ def smooth_sequence(
         True
     """
     belief = _start(model, mean, cov)
-    given = FilterInputs(
-        observation, observed, previous_action, reset, None, None, mean, None,
-        belief.cov.to(mean.dtype),
-    )  # fmt: skip
-    model.check_inputs(given, reset.shape[:-1])
+    inputs = FilterInputs(observation, observed, previous_action, reset, None, None, mean)
+    model.check_inputs(inputs, reset.shape[:-1])
     H, offset, dtype = model.emission_matrix, model.offset(previous_action), mean.dtype
     with without_autocast(mean):
         filtered, predictions = [], []
         for t in range(reset.shape[-1]):
             R = model.emission_cov if emission_cov is None else emission_cov[..., t, :, :]
-            step = _predict(model, belief, previous_action[..., t, :], jacobian, reset[..., t])
+            given = previous_action[..., t, :], jacobian, reset[..., t]
+            predictions.append(_predict(model, belief, *given))
             arrived = (observation[..., t, :], observed[..., t, :], H, R, offset[..., t, :])
-            belief = update(step.predicted, *arrived)
+            belief = update(predictions[-1][0], *arrived)
             if model.mask_model is not None:
                 belief, _ = update_by_mask(belief, *arrived, model.mask_model)
             filtered.append(belief)
-            predictions.append(step)
         smoothed = filtered[-1:]
         for (m, P), (after, F, Q) in zip(filtered[-2::-1], predictions[:0:-1], strict=True):
             factor = factorise("the predicted covariance", after.cov)
@@ -145,8 +140,8 @@ def forecast(
         belief = _start(model, mean, cov)
         never, steps = torch.zeros(start, dtype=torch.bool, device=mean.device), []
         for a in action.unbind(-2):
-            steps.append(_predict(model, belief, a, jacobian, never).predicted)
-            belief = steps[-1]
+            belief, *_ = _predict(model, belief, a, jacobian, never)
+            steps.append(belief)
         state = _stacked(steps, belief, dtype)
         readings = state.mean @ H.mT + model.offset(action)
         return Forecast(state, Belief(readings, H @ state.cov @ H.mT + model.full_emission_cov()))
@@ -173,18 +168,10 @@ def row_jacobian(
     return by_row.movedim(0, -2)
 
 
-class _Step(NamedTuple):
-    """A predicted belief, and how it came from the filtered one before: F and Q."""
-
-    predicted: Belief
-    jacobian: Tensor
-    transition_cov: Tensor
-
-
 def _predict(
     model: StateSpace, belief: Belief, action: Tensor, jacobian: Jacobian | None, reset: Tensor
-) -> _Step:
-    """Predict one step in float64; at a reset the initial belief, on which F = 0 lets nothing."""
+) -> tuple[Belief, Tensor, Tensor]:
+    """Return the predicted belief, float64, and F, Q; F = 0 at a reset, which nothing passes."""
     row, dtype = reset.unsqueeze(-1), model.emission_matrix.dtype
     mean = belief.mean.masked_fill(row, 0.0).to(dtype)
     F = model.transition_jacobian if jacobian is None else jacobian
@@ -196,11 +183,9 @@ def _predict(
     Q = as_matrix("transition_cov", Q if isinstance(Q, Tensor) else Q(mean, action), mean.shape[-1])
     F, Q, block = F.double(), Q.double(), row.unsqueeze(-1)
     F = torch.where(block, 0.0, F)
-    moved = model.predicted_mean(mean, action, row).double()
-    before = Belief(mean, belief.cov.masked_fill(block, 0.0))
-    cov = predict(before, lambda *_: moved, Q, action, jacobian=F).cov
-    cov = torch.where(block, model.full_initial_cov().double(), cov)
-    return _Step(Belief(moved, cov), F, Q)
+    moved = F @ belief.cov.masked_fill(block, 0.0) @ F.mT
+    cov = torch.where(block, model.full_initial_cov().double(), 0.5 * (moved + moved.mT) + Q)
+    return Belief(model.predicted_mean(mean, action, row).double(), cov), F, Q
 
 
 def _start(model: StateSpace, mean: Tensor, cov: Tensor | None) -> Belief:

@@ -1,7 +1,5 @@
 """The state-space model as plain tensors, checked once, and its prediction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -72,13 +70,9 @@ class TransitionMLP(NamedTuple):
             slope = (before > 0).to(mean.dtype) if self.activation == "relu" else 1 - hidden**2
             slopes.append(slope.reshape(-1, slope.shape[-1]))
         first, last = self.weights[0][:, :state], len(slopes)
-        if average and last <= 2:
-            found = first
-            if last == 1:
-                found = self.weights[1] @ (slopes[0].mean(0).unsqueeze(-1) * first)
-            elif last == 2:
-                both = slopes[1].mT @ slopes[0] / len(slopes[0])
-                found = self.weights[2] @ (both * self.weights[1]) @ first
+        if average and last == 2:
+            both = slopes[1].mT @ slopes[0] / len(slopes[0])
+            found = self.weights[2] @ (both * self.weights[1]) @ first
         else:
             found = first.expand(mean[..., 0].numel(), -1, -1)
             for slope, weight in zip(slopes, self.weights[1:], strict=True):

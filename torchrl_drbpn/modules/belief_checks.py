@@ -1,7 +1,5 @@
 """Tell readings that are no numbers from a model that has diverged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

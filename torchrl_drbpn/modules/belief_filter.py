@@ -1,7 +1,5 @@
 """The belief filter on tensors: a learned state-space model and its Kalman update."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """The belief filter with TensorDict keys, in the place of TorchRL's GRUModule."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

@@ -1,7 +1,5 @@
 """Standardise observations with missing entries by statistics that belong to the agent."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal

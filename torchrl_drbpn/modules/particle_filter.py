@@ -1,7 +1,5 @@
 """The particle filter with TensorDict keys, in the place of TorchRL's GRUModule."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import dispatch

@@ -1,7 +1,5 @@
 """The networks of deep variational reinforcement learning, and their particle filter on tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple

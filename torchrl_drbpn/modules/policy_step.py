@@ -1,7 +1,5 @@
 """One decision on plain tensors: what runs on the robot, for torch.export and AOTInductor."""
 
-from __future__ import annotations
-
 import copy
 
 import torch

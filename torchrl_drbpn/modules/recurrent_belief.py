@@ -1,7 +1,5 @@
 """What belief modules share with TorchRL's GRUModule: keys, mode, recurrent state, primer."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

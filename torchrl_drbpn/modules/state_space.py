@@ -1,7 +1,5 @@
 """The learned state-space model: how the state moves, and what the sensors make of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from numbers import Integral
@@ -185,11 +183,6 @@ class GaussianTransition(nn.Module):
     def mean_network(self) -> TransitionMLP:
         """Return f as tensors, as the native filter reads it."""
         return TransitionMLP(*_tensors(self.layers), self.residual, self.activation)
-
-    @property
-    def constant_cov(self) -> bool:
-        """Whether Q is a free parameter rather than a network."""
-        return self.noise is not None
 
     def cov(self, mean: Tensor | None = None, action: Tensor | None = None) -> Tensor:
         """Return Q; where it is a network, of both arguments, ``(*batch, state, state)``."""
