@@ -1,7 +1,5 @@
 """Problems for the sequence filter: one model, one set of sequences, the oracle beside them."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import Any
@@ -9,15 +7,20 @@ from typing import Any
 import oracles
 import pytest
 import torch
+from small_agents import make_filter
 from torch import Tensor
 
+from torchrl_drbpn import BeliefFilter, GaussianTransition, LinearGaussianEmission
 from torchrl_drbpn.functional import (
     FilterOutput,
     StateSpace,
     TransitionMLP,
     filter_sequence,
+    innovation,
+    log_likelihood,
     native,
     native_status,
+    update,
 )
 
 SIZES = [
@@ -37,6 +40,62 @@ TOLERANCE = 1e-10
 
 def assert_equal(actual: Tensor, expected: Tensor, tolerance: float = TOLERANCE) -> None:
     torch.testing.assert_close(actual, expected, atol=tolerance, rtol=tolerance)
+
+
+def outputs(*step: Any) -> tuple[Tensor, ...]:
+    """Residual and innovation covariance, filtered mean and covariance, log-likelihood."""
+    return (*innovation(*step), *update(*step), log_likelihood(*step))
+
+
+def make_model(
+    kind: str, dtype: torch.dtype = torch.float64, obs: int = 5, action: int = 2, **options: Any
+) -> BeliefFilter:
+    """A filter of fixed parameters, all away from their starting values."""
+    state = {"information": 3, "free": 7, "network": 3}.get(kind, obs)
+    place = {"cov": "full", "dtype": dtype}
+    if kind == "full":
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            transition = GaussianTransition(state, action, activation="tanh", **place)
+        emission = LinearGaussianEmission(obs, state, action, **place)
+        options |= {"transition": transition, "emission": emission}
+    if kind in ("propagated", "row"):
+        options |= {"covariance": "propagated", "jacobian": "row" if kind == "row" else "mean"}
+    return make_filter(obs, action, dtype, state, cov_network=kind == "network", **options)
+
+
+def by_hand(
+    model: BeliefFilter,
+    mean: Tensor,
+    cov: Tensor | None,
+    previous_action: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    reset: Tensor,
+    **options: Any,
+) -> oracles.Sequence:
+    """The oracle with a filter's own transition and emission."""
+    emission, propagated = model.emission, model.covariance == "propagated"
+    given = {
+        "transition": lambda m, a: model.transition(m, a)[0],
+        "transition_cov": lambda m, a: model.transition(m, a)[1],
+        "jacobian": model.mean_jacobian if propagated else None,
+        "noise": emission.cov(),
+    }
+    return oracles.filter_sequence(
+        observation=observation,
+        observed=observed,
+        previous_action=previous_action,
+        reset=reset,
+        start_mean=mean,
+        start_cov=cov,
+        initial_mean=model.initial_mean,
+        initial_cov=model.initial_cov,
+        matrix=emission.matrix,
+        action_matrix=emission.action_matrix,
+        bias=emission.offset,
+        **(given | options),
+    )
 
 
 class Problem:
@@ -169,7 +228,7 @@ class Problem:
     def library(self, form: str) -> FilterOutput:
         return self.run(form, **self.stored(), weight=self.weight, return_cov=True)
 
-    def oracle(self, transition_cov: Any = None) -> tuple[Tensor, Tensor, Tensor]:
+    def oracle(self) -> tuple[Tensor, Tensor, Tensor]:
         q, p, r = self.covs()
         noise, observed = r if self.full_noise else torch.diag(r), self.observed
         if self.weight is not None:
@@ -187,7 +246,7 @@ class Problem:
             initial_mean=self.leaves["initial_mean"],
             initial_cov=p,
             transition=oracles.mean_network(weights, biases, self.residual, self.activation),
-            transition_cov=q if transition_cov is None else transition_cov,
+            transition_cov=q,
             matrix=self.leaves["matrix"],
             noise=noise,
             action_matrix=self.leaves["action_matrix"],

@@ -1,10 +1,8 @@
 """Slow float64 truths that the library is held to.
 
-Everything here is written from the definitions and shares no code with the package. A missing
-entry is missing in the plainest way: its row is deleted (`x[rows]`, `H[rows]`, `R[rows][:, rows]`)
-before any arithmetic. Batch and time are Python loops, linear systems go through
-`torch.linalg.solve` (LU, where the library uses Cholesky), and every gradient is what autograd
-makes of that. Nothing here is fast and nothing here is clever.
+Everything here is written from the definitions and shares no code with the package. The row of a
+missing entry is deleted before any arithmetic. Batch and time are Python loops, linear systems go
+through `torch.linalg.solve` (LU, where the library uses Cholesky).
 
 Symbols: m, P are the mean and covariance of a belief, H, R, B, d the emission of eq. (3)
 x = H s + B a + d + noise, Q the transition covariance, rows the indices of the observed entries.
@@ -106,7 +104,7 @@ def filter_sequence(
     transition: Transition,
     transition_cov: Tensor | Transition,
     matrix: Tensor,
-    noise: Tensor,
+    noise: Tensor | Callable[..., Tensor],
     action_matrix: Tensor | None = None,
     bias: Tensor | None = None,
     jacobian: Tensor | Transition | None = None,
@@ -123,7 +121,8 @@ def filter_sequence(
     Where both hold, the reset wins. `transition_cov` is a matrix or a function of (mean, action),
     so is `jacobian`: with it the covariance is propagated, from `start_cov` (b, s, s) and
     `stored_cov` (b, t, s, s); what is propagated is a constant of autograd.
-    `noise` is R (n, n), or of every step one of its own (b, t, n, n).
+    `noise` is R (n, n), or of every step one of its own (b, t, n, n), or a function of the
+    predicted mean and covariance, the observation, its mask and the offset.
     """
     batch, time = observed.shape[:2]
     means, covs, lls = [], [], []
@@ -148,8 +147,12 @@ def filter_sequence(
                     offset = offset + action_matrix @ action
                 if bias is not None:
                     offset = offset + bias
-            own = noise[b, t] if noise.ndim == 4 else noise
-            step = (observation[b, t], observed[b, t], matrix, own, offset)
+            x, seen = observation[b, t], observed[b, t]
+            if callable(noise):
+                own = noise(mean, cov, x, seen, offset)
+            else:
+                own = noise[b, t] if noise.ndim == 4 else noise
+            step = (x, seen, matrix, own, offset)
             lls.append(log_likelihood(mean, cov, *step))
             mean, cov = update(mean, cov, *step)
             means.append(mean)
@@ -299,36 +302,33 @@ def simulate(
     return Data(observation, observed, action, reset, start_mean)
 
 
-def joint_log_likelihood(system: LinearSystem, data: Data, row: int) -> Tensor:
-    """Log density of all observed entries of one row under ONE joint Gaussian.
+def joint_gaussian(system: LinearSystem, data: Data, row: int) -> tuple[Tensor, ...]:
+    """Mean m and covariance P of all states of a row, and H, R, x of all that arrived.
 
-    The row starts from the initial belief at its first step. Every state is written as a linear
-    map of the first state and the process noises, so the stacked observations are one Gaussian
-    vector; its missing entries are deleted. No filter is involved.
+    The states are one Gaussian vector and x = H m + noise, missing entries deleted. No filter is
+    involved. The row starts from the initial belief; an episode start cuts what lies before.
     """
-    time, n, s = data.observed.shape[1], system.obs_dim, system.state_dim
-    source_cov = torch.block_diag(
-        system.initial_cov, *[system.transition_cov for _ in range(time - 1)]
-    )
-    rows_of_map, means = [], []
-    state_map = torch.zeros(s, s * time, dtype=torch.float64)
-    state_map[:, :s] = torch.eye(s, dtype=torch.float64)
-    mean = system.initial_mean
+    time, s = data.reset.shape[1], system.state_dim
+    means, blocks = [], {}
+    eye = torch.eye(s, dtype=torch.float64)
     for t in range(time):
-        action = data.previous_action[row, t]
-        if t > 0:
-            state_map = system.dynamics @ state_map
-            state_map[:, s * t : s * (t + 1)] += torch.eye(s, dtype=torch.float64)
-            mean = system.transition(mean, action)
-        rows_of_map.append(system.matrix @ state_map)
-        means.append(system.matrix @ mean + system.offset(action))
-    stacked = torch.cat(rows_of_map)
-    cov = stacked @ source_cov @ stacked.T + torch.block_diag(*[system.noise] * time)
-    keep = data.observed[row].reshape(time * n).nonzero().squeeze(-1)
-    x = data.observation[row].reshape(-1)[keep]
-    return torch.distributions.MultivariateNormal(
-        torch.cat(means)[keep], cov[keep][:, keep]
-    ).log_prob(x)
+        if t == 0 or data.reset[row, t]:
+            mean, F, Q = system.initial_mean, 0 * eye, system.initial_cov
+        else:
+            mean = system.transition(means[-1], data.previous_action[row, t])
+            F, Q = system.dynamics, system.transition_cov
+        means.append(mean)
+        for j in range(t):
+            blocks[t, j] = F @ blocks[t - 1, j]
+            blocks[j, t] = blocks[t, j].mT
+        blocks[t, t] = (F @ blocks[t - 1, t - 1] @ F.mT if t else 0) + Q
+    steps = range(time)
+    prior = torch.cat([torch.cat([blocks[i, j] for j in steps], 1) for i in steps])
+    seen = data.observed[row].flatten()
+    H = torch.block_diag(*[system.matrix] * time)[seen]
+    R = torch.block_diag(*[system.noise] * time)[seen][:, seen]
+    offset = system.offset(data.previous_action[row]).flatten()[seen]
+    return torch.cat(means), prior, H, R, data.observation[row].flatten()[seen] - offset
 
 
 def statsmodels(system: LinearSystem, data: Data) -> Any:
@@ -348,15 +348,3 @@ def statsmodels(system: LinearSystem, data: Data) -> Any:
         theirs[name] = value.numpy()
     theirs.initialize_known(system.initial_mean.numpy(), system.initial_cov.numpy())
     return theirs
-
-
-# Scalar random walk, A = H = Q = R = 1, covariance propagated. The predicted variance obeys
-# P = P - P^2 / (P + 1) + 1, that is P^2 - P - 1 = 0: it settles on the golden ratio, and the
-# filtered variance on P - 1.
-GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
-
-
-def scalar_random_walk() -> LinearSystem:
-    one = torch.ones(1, 1, dtype=torch.float64)
-    zero = torch.zeros(1, dtype=torch.float64)
-    return LinearSystem(one, 0 * one, one, one, 0 * one, zero, one, zero, one)

@@ -7,8 +7,6 @@ and then a fuzz of valid and of spoilt arguments: whatever the sizes, a call eit
 inside its memory. Leaks are not looked for: Python keeps memory on purpose.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

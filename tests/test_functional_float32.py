@@ -1,15 +1,8 @@
-"""What float32 may cost: with R at its floor the chosen form keeps its digits.
-
-Every figure is held to the same model in float64. Covariances of one step stay symmetric and
-positive definite, through 10,000 steps too.
-"""
-
-from __future__ import annotations
+"""What float32 may cost: with R at its floor the chosen form keeps the digits of float64."""
 
 import pytest
 import torch
 from filter_problems import FORMS, SIZES, Problem
-from kalman_cases import SEEDS
 from torch import Tensor
 
 from torchrl_drbpn import functional as F
@@ -145,7 +138,7 @@ def a_step(state: int, obs: int, batch: int, seed: int, *, full_noise: bool):
 def test_float32_covariances_are_symmetric_positive_definite_at_the_noise_floor(
     state, obs, full_noise
 ):
-    for seed in SEEDS:
+    for seed in range(3):
         h, _, r, belief, g = a_step(state, obs, 64, seed, full_noise=full_noise)
         observed = torch.rand(64, obs, generator=g) < torch.linspace(0, 1, 64)[:, None]
         step = (belief, torch.randn(64, obs, generator=g), observed, h, r)
@@ -174,23 +167,6 @@ def test_float32_covariances_survive_10000_iterations(state, obs, predicts):
     assert torch.isfinite(belief.mean).all()
     bad = (smallest_eigenvalues(torch.stack(history)).amin(-1) <= 0).nonzero()
     assert not len(bad), f"indefinite in {len(bad)} of 10,000 iterations, first at {int(bad[0])}"
-
-
-@pytest.mark.parametrize("dead", [False, True], ids=["random masks", "a sensor dead for good"])
-@pytest.mark.parametrize(("state", "obs"), [(17, 17), (32, 8)], ids=str)
-def test_float32_updates_of_a_correlated_belief_stay_positive_definite(state, obs, dead):
-    g = torch.Generator().manual_seed(0)
-    root = torch.randn(state, state, generator=g)
-    belief = Belief(torch.zeros(state), root @ root.T / state + 0.01 * torch.eye(state))
-    h, r = torch.randn(obs, state, generator=g) / state**0.5, 1e-4 * torch.eye(obs)
-    observed = torch.arange(obs) > 0
-    covs = []
-    for _ in range(1500):
-        if not dead:
-            observed = torch.rand(obs, generator=g) < 0.5
-        belief = F.update(belief, torch.randn(obs, generator=g), observed, h, r)
-        covs.append(belief.cov)
-    assert smallest_eigenvalues(torch.stack(covs)).min() > 0
 
 
 @pytest.mark.parametrize("std", [0.3, 3.0])

@@ -3,28 +3,43 @@
 Laws over masks, shapes and dimensions drawn at random are in test_functional_properties.py.
 """
 
-from __future__ import annotations
-
 import math
 
 import oracles
 import pytest
 import torch
-from filter_problems import assert_equal
-from kalman_cases import PATTERNS, SEEDS, SIZES, case, given, pattern
+from filter_problems import assert_equal, outputs
 from torch import Tensor
 
 from torchrl_drbpn import functional as F
-from torchrl_drbpn.functional.gaussian import Belief
+from torchrl_drbpn.functional.gaussian import (
+    Belief,
+    full_cov,
+    inverse_softplus,
+    masked_cov,
+    masked_log_density,
+    positive_std,
+    zero_missing,
+)
 
-sized = pytest.mark.parametrize(("state", "obs"), SIZES)
-seeded = pytest.mark.parametrize("seed", SEEDS)
+sized = pytest.mark.parametrize(
+    ("state", "obs"), [(3, 5), (4, 4), (6, 4)], ids=["state<obs", "state=obs", "state>obs"]
+)
+seeded = pytest.mark.parametrize("seed", [0, 1, 2])
 FUNCTIONS = ["innovation", "update", "log_likelihood"]
 
 
-def outputs(*step) -> tuple[Tensor, ...]:
-    """Residual and innovation covariance, filtered mean and covariance, log-likelihood."""
-    return (*F.innovation(*step), *F.update(*step), F.log_likelihood(*step))
+def given(state: int, obs: int, *, seed: int = 0, full_noise: bool = True):
+    """The arguments of a step, whose rows observe one entry, all, some and none; a generator."""
+    system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
+    g = torch.Generator().manual_seed(seed + 77)
+    mean = torch.randn(5, state, generator=g, dtype=torch.float64)
+    cov = torch.stack([oracles.spd(state, g) for _ in range(5)])
+    x = 2 * torch.randn(5, obs, generator=g, dtype=torch.float64)
+    offset = torch.randn(5, obs, generator=g, dtype=torch.float64)
+    observed = torch.rand(5, obs, generator=g) < 0.6
+    observed[0], observed[1], observed[2] = torch.arange(obs) == seed, True, False
+    return (Belief(mean, cov), x, observed, system.matrix, system.noise, offset), g
 
 
 def vector(*values: float) -> Tensor:
@@ -67,61 +82,6 @@ def test_readings_one_after_the_other_lead_where_all_at_once_do(state, obs, dtyp
         assert_equal(a.double(), e, tolerance)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@sized
-def test_nothing_observed_returns_the_predicted_belief_and_likelihood_zero(state, obs, dtype):
-    (belief, x, _, h, r, offset), _ = given(state, obs)
-    leaves = [t.to(dtype).requires_grad_() for t in (*belief, x, h, r, offset)]
-    mean, cov, *rest = leaves
-    rest.insert(1, torch.zeros_like(x, dtype=torch.bool))
-    *_, filtered_mean, filtered_cov, ll = outputs(Belief(mean, cov), *rest)
-    assert torch.equal(filtered_mean, mean)
-    assert torch.equal(filtered_cov, cov)
-    assert torch.equal(ll, torch.zeros_like(ll))
-    (filtered_mean.sum() + filtered_cov.sum() + ll.sum()).backward()
-    # x, H, R and the offset took no part, the belief passed through unchanged.
-    assert all(leaf.grad is None or not leaf.grad.any() for leaf in leaves[2:])
-    assert torch.equal(mean.grad, torch.ones_like(mean))
-    # Through either triangle: the symmetric part of the gradient is that of the identity map.
-    assert torch.allclose(cov.grad + cov.grad.mT, 2 * torch.ones_like(cov))
-
-
-@sized
-def test_an_unbounded_noise_variance_is_a_missing_entry(state, obs):
-    (belief, x, observed, h, r, offset), _ = given(state, obs, full_noise=False)
-    missing = F.update(belief, x, observed, h, r, offset)
-    errors = []
-    for variance in (1e6, 1e8, 1e10):
-        noise = r + torch.diag_embed(torch.where(observed, 0.0, variance).double())
-        for i in range(len(x)):
-            row = Belief(belief.mean[i], belief.cov[i]), x[i], torch.ones(obs, dtype=torch.bool)
-            one = F.update(*row, h, noise[i], offset[i])
-            errors.append(max((a - b[i]).abs().max() for a, b in zip(one, missing, strict=True)))
-    worst = torch.stack(errors).reshape(3, -1).amax(1)
-    assert worst[0] < 1e-3
-    assert (worst[1:] < worst[:-1] / 50).all()  # it falls as 1 / variance
-
-
-@seeded
-@sized
-def test_log_likelihood_is_that_of_the_multivariate_normal(state, obs, seed):
-    (belief, x, observed, h, r, offset), _ = given(state, obs, seed=seed)
-    mean, cov = belief.mean @ h.T + offset, h @ belief.cov @ h.T + r
-    whole = torch.distributions.MultivariateNormal(mean, cov).log_prob(x)
-    assert_equal(F.log_likelihood(belief, x, torch.ones_like(observed), h, r, offset), whole)
-    # Deleting an entry is integrating it out: by quadrature over the first one.
-    grid = torch.linspace(-60, 60, 24001, dtype=torch.float64)
-    swept = x[0].expand(len(grid), obs).clone()
-    swept[:, 0] = grid
-    first = Belief(belief.mean[0].expand(len(grid), -1), belief.cov[0].expand(len(grid), -1, -1))
-    complete = F.log_likelihood(
-        first, swept, torch.ones_like(swept).bool(), h, r, offset[0].expand_as(swept)
-    )
-    without = torch.arange(obs).expand_as(x) > 0
-    marginal = F.log_likelihood(belief, x, without, h, r, offset)[0]
-    assert_equal(marginal, torch.trapezoid(complete.exp(), grid).log(), 1e-8)
-
-
 @sized
 def test_innovation_is_the_residual_with_zeros_and_the_unmasked_covariance(state, obs):
     (belief, x, observed, h, r, offset), _ = given(state, obs)
@@ -132,21 +92,6 @@ def test_innovation_is_the_residual_with_zeros_and_the_unmasked_covariance(state
     without = outputs(belief, x, observed, h, r)
     for a, b in zip(without, outputs(belief, x, observed, h, r, 0 * x), strict=True):
         assert_equal(a, b)
-
-
-@pytest.mark.parametrize("kind", PATTERNS)
-def test_gradients_agree_with_finite_differences(kind):
-    system, belief, x, offset, g = case(2, 3, batch=1)
-    observed = pattern(kind, 3, g).expand_as(x)
-
-    def step(mean, root_p, x, h, root_r, offset):
-        # A factor keeps the covariances symmetric while entries of the factor are perturbed.
-        predicted = Belief(mean, root_p @ root_p.mT)
-        return outputs(predicted, x, observed, h, root_r @ root_r.mT, offset)[2:]
-
-    roots = torch.linalg.cholesky(belief.cov), torch.linalg.cholesky(system.noise)
-    leaves = (belief.mean, roots[0], x, system.matrix, roots[1], offset)
-    assert torch.autograd.gradcheck(step, [t.clone().requires_grad_() for t in leaves])
 
 
 def test_two_steps_by_hand():
@@ -166,21 +111,9 @@ def test_two_steps_by_hand():
             assert_equal(a, vector(e).reshape(a.shape))
 
 
-def test_two_steps_by_hand_with_the_covariance_propagated():
-    # Scalar, s' = s / 2, x = s + noise, Q = R = 1, start N(0, 4).
-    # Step 1: P = 4/4 + 1 = 2, K = 2/3, x = 3: mean = 2, cov = 2/3.
-    # Step 2: P = 1/6 + 1 = 7/6, K = 7/13, x = 14 / 1: predicted 1, v = 13: mean = 8, cov = 7/13.
-    one = torch.ones(1, 1, dtype=torch.float64)
-    belief = Belief(vector(0.0), 4 * one)
-    for x, mean, cov in [(3.0, 2.0, 2 / 3), (14.0, 8.0, 7 / 13)]:
-        predicted = F.predict(belief, lambda m, _: m / 2, one, vector(0.0), jacobian=one / 2)
-        belief = F.update(predicted, vector(x), torch.ones(1).bool(), one, one)
-        assert_equal(belief.mean, vector(mean))
-        assert_equal(belief.cov, cov * one)
-
-
 def test_predict_forgets_the_covariance_where_the_jacobian_is_none():
-    system, belief, _, _, g = case(3, 4)
+    system = oracles.random_system(3, 4)
+    (belief, *_), g = given(3, 4)
     action = torch.randn(5, 2, generator=g, dtype=torch.float64)
     q = system.transition_cov
     plain = F.predict(belief, system.transition, q, action, jacobian=None)
@@ -196,23 +129,6 @@ def test_predict_forgets_the_covariance_where_the_jacobian_is_none():
     )
 
 
-def test_independent_sensors_average_by_precision_and_independent_coordinates_stay_apart():
-    # Of one state: mean = (m / P + sum x_i / r_i) / (1 / P + sum 1 / r_i), cov = one over that sum.
-    x, r, observed = vector(1, -2, 4), vector(0.5, 2, 1), torch.tensor([True, False, True])
-    p, m = 3.0, 0.7
-    precision = 1 / p + (observed / r).sum()
-    h = torch.ones(3, 1, dtype=torch.float64)
-    filtered = F.update(Belief(vector(m), vector(p)[None]), x, observed, h, r.diag())
-    assert_equal(filtered.mean, ((m / p + (observed * x / r).sum()) / precision).reshape(1))
-    assert_equal(filtered.cov, (1 / precision).reshape(1, 1))
-    # H = I, P and R diagonal: entry i moves coordinate i alone, with gain p_i / (p_i + r_i).
-    p, m, eye = vector(0.3, 1, 2), vector(1, 2, 3), torch.eye(3, dtype=torch.float64)
-    filtered = F.update(Belief(m, p.diag()), x, observed, eye, r.diag())
-    gain = torch.where(observed, p / (p + r), 0.0)
-    assert_equal(filtered.mean, m + gain * (x - m))
-    assert_equal(filtered.cov, torch.diag(p * (1 - gain)))
-
-
 def propagated(system, x, observed, action, belief):
     """Predicted and filtered beliefs and the log-likelihood of each step; the first is given."""
     for t in range(len(x)):
@@ -224,14 +140,6 @@ def propagated(system, x, observed, action, belief):
         yield predicted, belief, F.log_likelihood(*step)
 
 
-def test_the_scalar_random_walk_settles_on_the_golden_ratio():
-    system, zeros = oracles.scalar_random_walk(), torch.zeros(60, 1, dtype=torch.float64)
-    start = Belief(system.initial_mean, 50 * system.initial_cov)
-    *_, (predicted, filtered, _) = propagated(system, zeros, zeros == 0, zeros, start)
-    assert_equal(predicted.cov, torch.full_like(predicted.cov, oracles.GOLDEN_RATIO))
-    assert_equal(filtered.cov, torch.full_like(filtered.cov, oracles.GOLDEN_RATIO - 1))
-
-
 @seeded
 @sized
 def test_step_likelihoods_sum_to_one_joint_gaussian_when_the_covariance_is_propagated(
@@ -241,7 +149,9 @@ def test_step_likelihoods_sum_to_one_joint_gaussian_when_the_covariance_is_propa
     data = oracles.simulate(system, batch=1, time=6, seed=seed)
     rows = data.observation[0], data.observed[0], data.previous_action[0]
     steps = propagated(system, *rows, Belief(system.initial_mean, system.initial_cov))
-    assert_equal(sum(ll for *_, ll in steps), oracles.joint_log_likelihood(system, data, row=0))
+    mean, prior, H, R, x = oracles.joint_gaussian(system, data, row=0)
+    joint = torch.distributions.MultivariateNormal(H @ mean, H @ prior @ H.mT + R)
+    assert_equal(sum(ll for *_, ll in steps), joint.log_prob(x))
 
 
 def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagated():
@@ -306,3 +216,115 @@ def test_two_exact_sensors_of_one_quantity_are_one_clear_line(function):
     belief, seen = Belief(torch.zeros(1), torch.eye(1)), torch.ones(2, dtype=torch.bool)
     with pytest.raises(ValueError, match=r"not positive definite.*without noise \(R = 0\)"):
         getattr(F, function)(belief, torch.ones(2), seen, torch.ones(2, 1), torch.zeros(2))
+
+
+DTYPES = [torch.float32, torch.float64]
+# Nothing, one entry, some, all.
+MASKS = pytest.mark.parametrize(
+    "mask",
+    [[False] * 4, [False, False, True, False], [True, False, True, True], [True] * 4],
+    ids=["none", "one", "some", "all"],
+)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def case(mask: list[bool], batch: int = 3) -> tuple[Tensor, Tensor, Tensor]:
+    g = generator()
+    residual = torch.randn(batch, 4, generator=g, dtype=torch.float64)
+    cov = torch.stack([oracles.spd(4, g) for _ in range(batch)])
+    return residual, cov, torch.tensor(mask).expand(batch, 4)
+
+
+@MASKS
+def test_masked_log_density_is_that_of_the_sub_vector(mask):
+    residual, cov, observed = case(mask)
+    actual = masked_log_density(residual, cov, observed)
+    rows = torch.tensor(mask).nonzero().squeeze(-1)
+    expected = torch.zeros(3, dtype=torch.float64)
+    if len(rows):
+        zeros = torch.zeros(len(rows), dtype=torch.float64)
+        sub = torch.distributions.MultivariateNormal(zeros, cov[:, rows][:, :, rows])
+        expected = sub.log_prob(residual[:, rows])
+    torch.testing.assert_close(actual, expected, atol=1e-11, rtol=1e-11)
+    # A count of entries held as an integer times a Python float would be float32.
+    single = masked_log_density(residual.float(), cov.float(), observed)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), actual, atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("junk", [math.nan, math.inf, -math.inf])
+def test_what_stands_at_missing_entries_does_not_reach_the_density(junk):
+    residual, cov, observed = case([True, False, True, False])
+    clean = masked_log_density(residual, cov, observed)
+    dirty = torch.where(observed, residual, torch.full_like(residual, junk)).requires_grad_()
+    value = masked_log_density(dirty, cov, observed)
+    assert torch.equal(value, clean)
+    value.sum().backward()
+    assert torch.equal(dirty.grad[~observed], torch.zeros(6, dtype=torch.float64))
+    assert torch.isfinite(dirty.grad).all()
+
+
+def test_one_covariance_serves_a_whole_batch_of_masks():
+    residual, cov, _ = case([True] * 4, batch=16)
+    masks = torch.cartesian_prod(*[torch.tensor([False, True])] * 4)
+    shared = masked_log_density(residual, cov[0], masks)
+    each = masked_log_density(residual, cov[0].expand_as(cov), masks)
+    torch.testing.assert_close(shared, each, atol=0, rtol=0)
+
+
+@MASKS
+def test_the_masked_matrix_has_the_determinant_and_inverse_of_the_sub_matrix(mask):
+    _, cov, observed = case(mask, batch=1)
+    masked = masked_cov(cov, observed)[0]
+    rows = torch.tensor(mask).nonzero().squeeze(-1)
+    sub = cov[0][rows][:, rows]
+    torch.testing.assert_close(torch.logdet(masked), torch.logdet(sub))
+    inverse = torch.linalg.inv(masked)
+    torch.testing.assert_close(inverse[rows][:, rows], torch.linalg.inv(sub))
+    missing = (~torch.tensor(mask)).nonzero().squeeze(-1)
+    assert torch.equal(masked[missing], torch.eye(4, dtype=torch.float64)[missing])
+
+
+def test_masking_ignores_junk_in_the_rows_of_missing_entries():
+    _, cov, observed = case([True, False, True, True], batch=1)
+    junk = cov.clone()
+    junk[:, 1] = math.nan
+    junk[:, :, 1] = math.inf
+    assert torch.equal(masked_cov(junk, observed), masked_cov(cov, observed))
+
+
+@pytest.mark.parametrize("dtype", [*DTYPES, torch.float16], ids=str)
+def test_zero_missing_keeps_what_arrived_and_its_dtype(dtype):
+    values = torch.tensor([1.0, math.nan, -3.0, math.inf], dtype=dtype)
+    observed = torch.tensor([True, False, True, False])
+    filled = zero_missing(values, observed)
+    assert filled.dtype == dtype
+    assert filled.tolist() == [1.0, 0.0, -3.0, 0.0]
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_inverse_softplus_undoes_softplus(dtype):
+    value = torch.logspace(-6, 3, 40, dtype=dtype)
+    raw = inverse_softplus(value)
+    assert torch.isfinite(raw).all()
+    torch.testing.assert_close(torch.nn.functional.softplus(raw), value, atol=0, rtol=1e-5)
+    torch.testing.assert_close(positive_std(raw, 1e-2), value + 1e-2)
+
+
+def test_float32_full_covariances_can_be_factorised_for_extreme_parameters():
+    raw = torch.stack([torch.full((6, 6), value) for value in (-1e4, -10.0, 0.0, 3.0)])
+    factor, info = torch.linalg.cholesky_ex(full_cov(raw, 1e-2))
+    assert torch.equal(info, torch.zeros_like(info))
+    assert torch.isfinite(factor).all()
+
+
+def test_every_full_covariance_above_the_floor_can_be_reached_by_a_lower_triangle():
+    target = oracles.spd(4, generator(1)) + 0.02 * torch.eye(4, dtype=torch.float64)
+    root = torch.linalg.cholesky(target - 0.01 * torch.eye(4, dtype=torch.float64))
+    raw = root.tril(-1) + torch.diag(inverse_softplus(root.diagonal()))
+    torch.testing.assert_close(full_cov(raw, 0.1), target)
+    spoilt = raw + torch.triu(torch.full((4, 4), 7.0), 1)  # the upper one is not read
+    assert torch.equal(full_cov(raw, 0.1), full_cov(spoilt, 0.1))

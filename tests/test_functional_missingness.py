@@ -1,15 +1,7 @@
-"""What `functional/missingness.py` promises: the laws of missingness and noise.
+"""The laws of missingness, outages, noise and spikes.
 
-MCAR: every entry missing with probability eta. MAR and NMAR: P(missing_i) = min(sigmoid(b1_i . a +
-b2_i . x + b0_i), eta), x being the always observed entries (MAR) or all (NMAR); 0 for the always
-observed ones. The oracle is that sentence as a loop over entries. Realised ratios lie within a few
-standard errors, sqrt(p (1 - p) / n), of the law. Outages: a two-state Markov chain, whose runs are
-geometric with the given mean and whose share of time off is eta, from the first step on. Spikes: an
-entry is hit with its probability and its error has the given deviation. Randomness comes from the
-generator passed in alone.
+Realised ratios lie within a few standard errors, sqrt(p (1 - p) / n), of the law.
 """
-
-from __future__ import annotations
 
 import itertools
 import math
@@ -99,17 +91,6 @@ def test_no_previous_action_is_the_zero_action():
     assert not torch.equal(none, missing_probability(drawn, x, action, 0.9))
 
 
-@pytest.mark.parametrize(("kind", "depends"), [("mar", False), ("nmar", True)])
-def test_only_nmar_depends_on_entries_that_may_be_missing(kind, depends):
-    x, action = example()
-    drawn = mechanism(kind)
-    moved = x.clone()
-    moved[:, ~drawn.always_observed] += 1.0
-    before = missing_probability(drawn, x, action, 1.0)
-    after = missing_probability(drawn, moved, action, 1.0)
-    assert torch.equal(before, after) is not depends
-
-
 @pytest.mark.parametrize("eta", [0.05, 0.3, 0.9])
 def test_the_realised_ratio_of_mcar_is_eta(eta):
     missing = 1 - sample_mask(eta, torch.zeros(10_000, OBS), seeded(1)).double()
@@ -117,15 +98,6 @@ def test_the_realised_ratio_of_mcar_is_eta(eta):
     assert ((missing.mean(0) - eta).abs() < 4 * error).all()
     # and entries go missing independently
     assert (torch.corrcoef(missing.T) - torch.eye(OBS)).abs().max() < 0.045
-
-
-@pytest.mark.parametrize("kind", ["mar", "nmar"])
-def test_always_observed_entries_never_go_missing(kind):
-    drawn = mechanism(kind)
-    x, action = example((5000,))
-    observed = sample_mask(missing_probability(drawn, x, action, 1.0), x, seeded(4))
-    assert observed[:, drawn.always_observed].all()
-    assert not observed[:, ~drawn.always_observed].all(0).any()
 
 
 def test_masks_and_hits_depend_on_the_generator_and_not_on_the_dtype():
@@ -205,13 +177,6 @@ def test_every_step_of_the_chain_misses_eta_from_the_first_on(mean_length):
     working = chain(0.4, mean_length, 30, 20_000)
     missing = 1 - working.double().mean(1)
     assert ((missing - 0.4).abs() < 4.5 * math.sqrt(0.4 * 0.6 / 20_000)).all()
-
-
-def test_outages_of_mean_length_1_over_1_minus_eta_have_no_memory():
-    rates = outage_rates(0.75, 4.0)
-    assert rates.failure == pytest.approx(1 - rates.repair)  # the same whether on or off
-    strict = chain(0.5, 1.0, 10, 50)
-    assert (strict[1:] == ~strict[:-1]).all()  # the shortest possible: on and off in turn
 
 
 def test_spikes_hit_with_their_probability_and_have_their_deviation():

@@ -1,16 +1,13 @@
 """Laws of `functional` over masks, shapes, dtypes and dimensions drawn at random."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
 import oracles
 import torch
-from filter_problems import Problem
+from filter_problems import Problem, outputs
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
 from torchrl_drbpn import functional as F
 from torchrl_drbpn.functional.gaussian import Belief
@@ -35,12 +32,6 @@ def draw(state, obs, seed, batch, share, full_noise, dtype) -> tuple[list, torch
     observed = torch.rand(*batch, obs, generator=g) < share
     belief = Belief(mean.to(dtype), ((cov + cov.mT) / 2).to(dtype))
     return [belief, x.to(dtype), observed, system.matrix, system.noise, offset.to(dtype)], g
-
-
-def outputs(belief: Belief, *rest: Tensor) -> tuple[Tensor, ...]:
-    """Residual and innovation covariance, filtered mean and covariance, log-likelihood."""
-    step = (belief, *rest)
-    return (*F.innovation(*step), *F.update(*step), F.log_likelihood(*step))
 
 
 def assert_near(actual, expected, dtype: torch.dtype = torch.float64) -> None:

@@ -1,12 +1,4 @@
-"""The smoother and the forecast.
-
-Specified here: on a linear system the smoothed beliefs are those of one joint Gaussian of all
-states and readings, in values and in gradients, and those of statsmodels; on another they are the
-textbook recursion with the row-wise Jacobian, or with the one given. No episode start is crossed.
-A forecast is what the smoother says of steps without a reading behind the last.
-"""
-
-from __future__ import annotations
+"""The smoother and the forecast, held to one joint Gaussian of all states and readings."""
 
 import math
 
@@ -20,7 +12,6 @@ from torchrl_drbpn import BeliefFilter
 from torchrl_drbpn.functional import (
     Belief,
     StateSpace,
-    filter_sequence,
     forecast,
     row_jacobian,
     smooth_sequence,
@@ -51,30 +42,11 @@ def inputs(data: oracles.Data, rows: slice = slice(None), steps: slice = slice(N
 def joint_posterior(system: oracles.LinearSystem, data: oracles.Data, row: int) -> Belief:
     """All states of a row given all its readings, by conditioning one joint Gaussian."""
     time, s = data.reset.shape[1], system.state_dim
-    means, blocks = [], {}
-    eye = torch.eye(s, dtype=torch.float64)
-    for t in range(time):
-        if data.reset[row, t]:
-            mean, F, Q = system.initial_mean, 0 * eye, system.initial_cov
-        else:
-            mean = system.transition(means[-1], data.previous_action[row, t])
-            F, Q = system.dynamics, system.transition_cov
-        means.append(mean)
-        for j in range(t):
-            blocks[t, j] = F @ blocks[t - 1, j]
-            blocks[j, t] = blocks[t, j].mT
-        blocks[t, t] = (F @ blocks[t - 1, t - 1] @ F.mT if t else 0) + Q
-    steps = range(time)
-    prior = torch.cat([torch.cat([blocks[i, j] for j in steps], 1) for i in steps])
-    seen = data.observed[row].flatten()
-    H = torch.block_diag(*[system.matrix] * time)[seen]
-    R = torch.block_diag(*[system.noise] * time)[seen][:, seen]
-    offset = system.offset(data.previous_action[row]).flatten()[seen]
-    mean = torch.cat(means)
+    mean, prior, H, R, x = oracles.joint_gaussian(system, data, row)
     gain = torch.linalg.solve(H @ prior @ H.mT + R, H @ prior).mT
-    mean = mean + gain @ (data.observation[row].flatten()[seen] - offset - H @ mean)
+    mean = mean + gain @ (x - H @ mean)
     cov = (prior - gain @ H @ prior).reshape(time, s, time, s)
-    return Belief(mean.reshape(time, s), torch.stack([cov[t, :, t] for t in steps]))
+    return Belief(mean.reshape(time, s), torch.stack([cov[t, :, t] for t in range(time)]))
 
 
 def test_it_is_the_joint_gaussian_conditioned_on_all_readings_with_its_gradients():
@@ -102,27 +74,6 @@ def test_it_is_the_joint_gaussian_conditioned_on_all_readings_with_its_gradients
         assert_equal(a, b)
     for name, a, b in zip(leaves, *gradients, strict=True):
         torch.testing.assert_close(a, b, atol=1e-8, rtol=1e-8, msg=lambda m, n=name: f"{n}: {m}")
-
-
-def test_it_equals_statsmodels():
-    system, data = linear(30, batch=1, reset_rate=0.0, seed=4)
-    truth = oracles.statsmodels(system, data).smooth()
-    mean, cov = smooth_sequence(space(system), *inputs(data))
-    assert_equal(mean[0], torch.from_numpy(truth.smoothed_state.T.copy()), 1e-8)
-    assert_equal(cov[0].movedim(0, -1), torch.from_numpy(truth.smoothed_state_cov), 1e-8)
-
-
-def test_an_episode_start_inside_equals_two_sequences():
-    system, data = linear(8, reset_rate=0.0)
-    data.reset[:, 5] = True
-    data.previous_action[:, 5] = 0
-    whole = smooth_sequence(space(system), *inputs(data))
-    parts = [
-        smooth_sequence(space(system), *inputs(data, steps=s)) for s in (slice(5), slice(5, 8))
-    ]
-    for name in ("mean", "cov"):
-        pieces = torch.cat([getattr(part, name) for part in parts], 1)
-        assert_equal(getattr(whole, name), pieces, 1e-13)
 
 
 def textbook(problem: Problem, row: int, jacobian: Tensor | None) -> list[tuple[Tensor, Tensor]]:
@@ -222,7 +173,6 @@ def test_float32_covariances_stay_positive_definite_at_the_noise_floor(expands):
     assert bool((torch.linalg.cholesky_ex(cov)[1] == 0).all())
 
 
-# ---------------------------------------------------------------------------------- forecasts
 def test_a_forecast_is_what_the_smoother_says_of_steps_without_readings():
     problem = Problem(3, 4, batch=2, time=6, resets=False)
     start, action, x, observed, reset = problem.arguments()
@@ -235,25 +185,6 @@ def test_a_forecast_is_what_the_smoother_says_of_steps_without_readings():
     H, R = problem.model().emission_matrix, problem.model().full_emission_cov()
     assert_equal(ahead.observation.mean, smoothed.mean @ H.mT + problem.model().offset(action))
     assert_equal(ahead.observation.cov, H @ smoothed.cov @ H.mT + R)
-
-
-def test_many_futures_of_a_linear_system_have_the_mean_and_covariance_of_its_forecast():
-    system = oracles.random_system(3, 4, seed=2)
-    action = torch.randn(5, 2, dtype=torch.float64)
-    mean, cov = system.initial_mean, system.initial_cov
-    ahead = forecast(space(system), mean, cov, action)
-    g = torch.Generator().manual_seed(0)
-
-    def noise(cov: Tensor) -> Tensor:
-        root = torch.linalg.cholesky(cov)
-        return torch.randn(40_000, len(cov), generator=g, dtype=torch.float64) @ root.mT
-
-    state = mean + noise(cov)
-    for a in action:
-        state = system.transition(state, a) + noise(system.transition_cov)
-    reading = state @ system.matrix.mT + system.offset(action[-1]) + noise(system.noise)
-    assert_equal(ahead.observation.mean[-1], reading.mean(0), 0.05)
-    assert_equal(ahead.observation.cov[-1], reading.mT.cov(), 0.05 * float(reading.var(0).max()))
 
 
 def test_the_first_forecast_of_a_constant_filter_is_its_own_prediction():
@@ -325,6 +256,3 @@ def test_bad_input_is_named_and_no_step_is_no_error():
     assert forecast(model, data.start_mean, None, data.previous_action[:, :0]).state.cov.shape == (
         3, 0, 3, 3,
     )  # fmt: skip
-    with torch.no_grad():
-        out = filter_sequence(model, *(x for x in inputs(data) if x is not None))
-    assert out.cov is None

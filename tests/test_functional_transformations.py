@@ -1,7 +1,5 @@
 """What PyTorch does to functions works on the filter: the values and gradients of a plain call."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 

@@ -1,11 +1,4 @@
-"""Entries missing for a reason: the model of the mask, and the belief that learns from it.
-
-Specified here: for one missing entry the update has the exact moments (numerical integration); a
-mask that says nothing changes nothing; on a linear system whose high readings are missing the
-filter that ignores it is biased, and the one that learned why removes more than half of the bias.
-"""
-
-from __future__ import annotations
+"""Entries missing for a reason: the model of the mask, and the belief that learns from it."""
 
 import math
 from dataclasses import replace

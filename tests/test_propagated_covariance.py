@@ -1,29 +1,15 @@
-"""The propagated covariance: P = F cov F' + Q, in both forms of the filter, up to the keys.
+"""The propagated covariance, P = F cov F' + Q: its digits, its Jacobian, its key.
 
-Specified here:
-
-- a NaN before a reset is harmless; while nothing arrives the covariance grows (that every form is
-  the oracle and a sequence its steps: test_functional_filtering.py);
-- on a linear system the likelihood of a row is that of one joint Gaussian;
-- float32 stays positive definite over 10,000 steps, under a transition that expands too;
-- the closed-form Jacobian is autograd's, for every network, of each row and on average;
-- a filter computes it at its first call, then only where asked; it is saved with the filter;
-- the covariance is part of the recurrent state, and its absence is named (that steps are the
-  sequence through the module: test_belief_filter_module.py).
+That every form is the oracle: test_functional_filtering.py; the module: test_belief_filter_module.
 """
-
-from __future__ import annotations
 
 import oracles
 import pytest
 import torch
-from belief_frames import BeliefFrames
-from filter_problems import FORMS, SIZES, TOLERANCE, Problem, assert_equal
-from tensordict import TensorDict
+from filter_problems import TOLERANCE, Problem, assert_equal, by_hand
 from torch import Tensor, nn
-from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn import BeliefFilter, BeliefFilterModule, GaussianTransition
+from torchrl_drbpn import BeliefFilter, GaussianTransition
 from torchrl_drbpn.functional import (
     Belief,
     StateSpace,
@@ -33,34 +19,6 @@ from torchrl_drbpn.functional import (
     filtered_cov,
 )
 
-# --- the filter -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_a_nan_before_a_reset_and_what_is_not_asked_for_change_nothing(form):
-    problem = Problem(3, 5, stored=True, propagated=True)
-    problem.reset[:, 0] = problem.reset[:, 3] = True
-    clean = problem.library(form)
-    gradients = problem.gradients(clean)
-    problem.start_cov = problem.start_cov * torch.nan
-    unused = ~problem.use_stored | problem.reset
-    problem.stored_cov = problem.stored_cov.masked_fill(unused[..., None, None], torch.nan)
-    for a, b in zip(problem.library(form), clean, strict=True):
-        assert torch.equal(a, b)
-    for name, gradient in problem.gradients(problem.library(form)).items():
-        assert torch.equal(gradient, gradients[name]), name
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_while_nothing_arrives_the_covariance_grows_by_the_transition(form):
-    problem = Problem(3, 5, resets=False, propagated=True)
-    problem.observed = torch.zeros_like(problem.observed)
-    out, cov = problem.library(form), problem.start_cov
-    for t in range(problem.reset.shape[1]):
-        cov = problem.jacobian @ cov @ problem.jacobian.mT + problem.covs()[0]
-        assert_equal(out.cov[:, t], cov)
-    assert torch.equal(out.log_likelihood, torch.zeros_like(out.log_likelihood))
-
 
 def linear(system: oracles.LinearSystem) -> StateSpace:
     weight = torch.cat([system.dynamics, system.control], 1)
@@ -69,20 +27,6 @@ def linear(system: oracles.LinearSystem) -> StateSpace:
         f, system.transition_cov, system.matrix, system.noise.diagonal(), system.action_matrix,
         system.bias, system.initial_mean, system.initial_cov, system.dynamics,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("form", ["auto", "pytorch"])
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_on_a_linear_system_the_likelihood_is_that_of_one_joint_gaussian(state, obs, form):
-    system = oracles.random_system(state, obs)
-    data = oracles.simulate(system, 3, 8)
-    data.reset[:, 0] = True
-    start = data.start_mean, torch.zeros(3, state, state).double()
-    inputs = (data.previous_action, data.observation, data.observed, data.reset)
-    out = filter_sequence(linear(system), start[0], *inputs, cov=start[1], form=form)
-    for row in range(3):
-        expected = oracles.joint_log_likelihood(system, data, row)
-        assert_equal(out.log_likelihood[row].sum(), expected)
 
 
 @pytest.mark.parametrize("form", ["auto", "pytorch"])
@@ -127,9 +71,6 @@ def test_what_a_propagated_covariance_needs_is_named():
     problem.jacobian = torch.eye(2).double()
     with pytest.raises(ValueError, match=r"`transition_jacobian` must have shape \(3, 3\)"):
         problem.model()
-
-
-# --- the Jacobian ---------------------------------------------------------------------------------
 
 
 class Own(nn.Module):
@@ -208,33 +149,8 @@ def test_a_filter_propagates_by_the_jacobian_of_its_transition(jacobian, own):
     filter.refresh_jacobian(mean, action)
     rows = torch.func.vmap(torch.func.jacrev(f))
     F = rows(mean, action).mean(0) if jacobian == "mean" else torch.func.jacrev(f)
-    model, start = filter.state_space(), (mean[:4], torch.eye(3).double().expand(4, 3, 3))
-    Q = filter.transition(mean[0], action[0])[1]
-    truth = oracles.filter_sequence(
-        observation=data[1], observed=data[2], previous_action=data[0], reset=data[3],
-        start_mean=start[0], start_cov=start[1], initial_mean=model.initial_mean,
-        initial_cov=model.full_initial_cov(), transition=f, transition_cov=Q,
-        matrix=model.emission_matrix, noise=model.full_emission_cov(),
-        action_matrix=model.action_matrix, bias=model.emission_offset, jacobian=F,
-    )  # fmt: skip
+    start = mean[:4], torch.eye(3).double().expand(4, 3, 3)
+    truth = by_hand(filter, *start, *data, jacobian=F)
     out = filter(*start, *data, return_cov=True)
     for a, b in zip(out, (truth.mean, truth.cov, truth.log_likelihood), strict=True):
         assert_equal(a, b, TOLERANCE)
-
-
-# --- keys -----------------------------------------------------------------------------------------
-
-
-def test_the_covariance_is_part_of_the_recurrent_state():
-    torch.manual_seed(0)
-    module = BeliefFilterModule(BeliefFilter(5, 2, 3, covariance="propagated"))
-    assert ("recurrent", "cov") in module.in_keys
-    assert ("next", "recurrent", "cov") in module.out_keys
-    primer = module.make_tensordict_primer()
-    assert primer.primers["recurrent", "cov"].shape == (3, 3)
-    frames = BeliefFrames().make_frames((4,))
-    frames["recurrent"] = TensorDict({"mean": torch.zeros(4, 3), "age": torch.ones(4, 1).long()})
-    frames = frames.auto_batch_size_(1)
-    for mode in (False, True):
-        with set_recurrent_mode(mode), pytest.raises(KeyError, match=r"recurrent', 'cov'.*not in"):
-            module(frames.unsqueeze(1) if mode else frames)

@@ -1,7 +1,5 @@
 """What the learned state-space model is held to: eq. (2), (3), (8) [DRBPN] and their noise."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 
