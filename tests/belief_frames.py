@@ -1,7 +1,5 @@
 """Frames for belief modules, and the two ways to run over them; see contracts.py."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -14,7 +12,7 @@ from torchrl.modules.utils import get_primers_from_module
 
 
 class BeliefFrames:
-    """What the contracts of belief modules share; no test is in here.
+    """What the contracts of belief modules share.
 
     Attributes:
         tolerance32: how far one step at a time and whole sequences may differ in float32, as a
@@ -52,6 +50,10 @@ class BeliefFrames:
             },
             shape,
         )
+
+    def any_module(self) -> TensorDictModuleBase:
+        """Return the module under test."""
+        raise NotImplementedError(f"{type(self).__name__} must say in `any_module` what is tested")
 
     def primers(self, module: TensorDictModuleBase) -> dict[Any, Any]:
         """Return the specs of the recurrent state; none where the module has no memory."""
@@ -121,3 +123,19 @@ class BeliefFrames:
                 atol=limit * scale,
                 msg=lambda text, key=key: f"{key}: {text}",
             )
+
+    def test_every_out_key_is_written_no_other_and_no_input_is_changed(self):
+        module = self.any_module()
+        frames = self.make_frames((3, 4))
+        frames["is_init"][:, 0] = frames["is_init"][1, 2] = True
+        rollout = self.one_by_one(module, frames, None)
+        before, sequence = rollout.clone(), self.as_sequence(module, rollout)
+        for out in (rollout, sequence):
+            names = {*self.frame_keys, *self.state_keys(module), *module.out_keys}
+            assert set(out.keys(True, True)) == names
+        for key in module.out_keys:
+            assert sequence[key].shape == rollout[key].shape, key
+            assert sequence[key].dtype == rollout[key].dtype, key
+        for key in module.in_keys:
+            assert torch.equal(sequence[key], before[key]), key
+            assert torch.equal(rollout[key], before[key]), key

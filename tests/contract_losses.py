@@ -1,7 +1,5 @@
 """Duties of every loss; see contracts.py."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A small particle filter of fixed parameters, and frames for it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

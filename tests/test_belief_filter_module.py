@@ -1,12 +1,13 @@
 """`BeliefFilterModule`: the requirements of a belief module, its own keys, bad input."""
 
-from __future__ import annotations
-
 import functools
 
 import pytest
 import torch
 from contracts import ACTION, OBS, BeliefModuleContract
+from filter_problems import by_hand
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from small_agents import make_filter as make_any_filter
 from tensordict import TensorDict, TensorDictBase
 from torchrl.modules import set_recurrent_mode
@@ -78,15 +79,23 @@ class TestContractOfAPropagatedCovariance(TestContract):
         return BeliefFilterModule(belief, **kwargs)
 
 
+class TestContractOfARobustUpdate(TestContract):
+    """Readings are weighed by the belief of each step; most weights are under 1."""
+
+    test_it_runs_in_batched_environments = None  # once is enough
+    test_a_reading_that_is_not_usable_is_named = None  # huge ones are: test_robust_update.py
+
+    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
+        options = {"covariance": "propagated", "robust": "huber", "robust_threshold": 0.5}
+        return BeliefFilterModule(make_any_filter(obs, action, dtype, **options), **kwargs)
+
+
 def test_the_keys_are_those_of_the_contract_and_a_list_renames_them_by_position():
     module = BeliefFilterModule(make_filter())
     four = ["observation", "observed", "previous_action", "is_init"]
     assert module.in_keys == [*four, ("recurrent", "mean"), ("recurrent", "age")]
     state = [("next", "recurrent", "mean"), ("next", "recurrent", "age")]
     assert module.out_keys == ["features", ("belief", "mean"), ("belief", "log_likelihood"), *state]
-    module = BeliefFilterModule(make_filter(), in_keys=["a", ("b", "c"), "d", "e"])
-    assert module.in_keys[:4] == ["a", ("b", "c"), "d", "e"]
-    assert module.in_keys[4:] == [("recurrent", "mean"), ("recurrent", "age")]
     module = BeliefFilterModule(make_filter(), in_keys=[*four, "f", ("g", "h")])
     assert module.out_keys[-2:] == [("next", "f"), ("next", "g", "h")]
     assert set(module.make_tensordict_primer().primers.keys(True, True)) == {"f", ("g", "h")}
@@ -144,34 +153,29 @@ def test_optional_entries_equal_the_textbook(state, options, over_time):
     with set_recurrent_mode(over_time):
         out = module(data.clone())
 
-    emission = model.emission
-    H, R = emission.matrix, emission.cov()
-    for b in range(3):
-        mean, cov = data["recurrent", "mean"][b, 0], data["recurrent", "cov"][b, 0]
-        for t in range(6):
-            first = bool(data["is_init"][b, t])
-            if first or not over_time:
-                mean, cov = data["recurrent", "mean"][b, t], data["recurrent", "cov"][b, t]
-            action = data["previous_action"][b, t]
-            moved = model.transition(mean, action)
-            if model.covariance == "propagated":
-                F = model.mean_jacobian
-                moved = functional.Belief(moved.mean, F @ cov @ F.mT + moved.cov)
-            if first and (data["recurrent", "age"][b, t] == 0 or not over_time):
-                moved = functional.Belief(model.initial_mean, model.initial_cov)
-            offset = emission.action_matrix @ action + emission.offset
-            args = (data["observation"][b, t], data["observed"][b, t], H, R, offset)
-            filtered = functional.update(moved, *args)
-            _, S = functional.innovation(moved, *args)
-            mean, cov = filtered
-            for key, expected in (
-                (("belief", "mean"), filtered.mean),
-                (("belief", "cov"), filtered.cov),
-                (("belief", "observation"), H @ filtered.mean + offset),
-                (("belief", "predicted_observation"), H @ moved.mean + offset),
-                (("belief", "innovation_cov"), S),
-            ):
-                torch.testing.assert_close(out[key][b, t], expected, rtol=1e-10, atol=1e-10)
+    first = data["is_init"].squeeze(-1)
+    mean, cov = data["recurrent", "mean"], data["recurrent", "cov"]
+    reset = first & (data["recurrent", "age"].squeeze(-1) == 0) if over_time else first
+    stored = first & ~reset if over_time else torch.ones_like(first)
+    given = data["previous_action"], data["observation"], data["observed"]
+    options = {"use_stored_state": stored, "stored_mean": mean, "stored_cov": cov}
+    filtered = by_hand(model, mean[:, 0], cov[:, 0], *given, reset, **options)
+    # what each step started from
+    begins = (stored | (torch.arange(6) == 0)).unsqueeze(-1)
+    before = torch.where(begins, mean, filtered.mean.roll(1, 1))
+    before_cov = torch.where(begins.unsqueeze(-1), cov, filtered.cov.roll(1, 1))
+    propagated = model.covariance == "propagated"
+    moved = model.predict(before, given[0], reset, before_cov if propagated else None)
+    emission, action = model.emission, given[0]
+    S = functional.innovation(moved, *given[1:], emission.matrix, emission.cov()).cov
+    for key, expected in (
+        (("belief", "mean"), filtered.mean),
+        (("belief", "cov"), filtered.cov),
+        (("belief", "observation"), emission(filtered.mean, action)),
+        (("belief", "predicted_observation"), emission(moved.mean, action)),
+        (("belief", "innovation_cov"), S),
+    ):
+        torch.testing.assert_close(out[key], expected, rtol=1e-10, atol=1e-10)
 
 
 def test_an_innovation_covariance_is_that_of_an_emission_with_a_forward_of_its_own():
@@ -251,3 +255,70 @@ def test_autocast_leaves_the_filter_in_its_own_dtype():
         for found, expected in zip(run(True, over_time), run(False, over_time), strict=True):
             assert found.dtype == torch.float32
             assert torch.equal(found, expected)
+
+
+CASES = {
+    "obs": st.integers(1, 6),
+    "state": st.integers(1, 6),
+    "action": st.integers(1, 3),
+    "batch": st.lists(st.integers(1, 3), max_size=2).map(tuple),
+    "time": st.integers(1, 5),
+    "share": st.sampled_from([0.0, 0.3, 1.0]),
+    "dtype": st.sampled_from([torch.float32, torch.float64]),
+    "seed": st.integers(0, 999),
+}
+
+
+def draw_case(obs, state, action, batch, time, share, dtype, seed):
+    """A module, and trajectories that begin in mid-episode with resets inside."""
+    g = torch.Generator().manual_seed(seed)
+    module = BeliefFilterModule(make_any_filter(obs, action, dtype, state))
+    shape = (*batch, time)
+    is_init = torch.rand(*shape, 1, generator=g) < 0.2
+    data = TensorDict(
+        {
+            "observation": torch.randn(*shape, obs, generator=g, dtype=dtype),
+            "observed": torch.rand(*shape, obs, generator=g) < share,
+            "previous_action": torch.randn(*shape, action, generator=g, dtype=dtype),
+            "is_init": is_init,
+            "recurrent": {
+                "mean": torch.randn(*shape, state, generator=g, dtype=dtype),
+                "age": torch.where(is_init, 0, 3),
+            },
+        },
+        shape,
+    )
+    return module, data
+
+
+@settings(max_examples=25, deadline=None, derandomize=True, database=None)
+@given(**CASES)
+def test_a_trajectory_is_its_steps_one_after_the_other(**case):
+    module, data = draw_case(**case)
+    with set_recurrent_mode(True), torch.no_grad():
+        whole = module(data.clone())
+    mean = data["recurrent", "mean"][..., 0, :]
+    limit = 1e-10 if case["dtype"] == torch.float64 else 1e-4
+    for t in range(case["time"]):
+        step = data[..., t].clone().set(("recurrent", "mean"), mean)
+        with torch.no_grad():
+            module(step)
+        mean = step["next", "recurrent", "mean"]
+        for key in module.out_keys[:3]:
+            expected = whole[key].select(len(case["batch"]), t)
+            torch.testing.assert_close(step[key], expected, rtol=limit, atol=10 * limit)
+            assert step[key].dtype == case["dtype"]
+
+
+@settings(max_examples=25, deadline=None, derandomize=True, database=None)
+@given(**CASES, junk=st.sampled_from([float("nan"), float("inf"), 1e30]))
+def test_what_did_not_arrive_is_not_read_and_nothing_costs_nothing(junk, **case):
+    module, data = draw_case(**case)
+    spoilt = data.clone()
+    spoilt["observation"] = torch.where(data["observed"], data["observation"], junk)
+    with set_recurrent_mode(True), torch.no_grad():
+        expected, received = module(data), module(spoilt)
+    for key in module.out_keys:
+        assert torch.equal(received[key], expected[key])
+    nothing = ~data["observed"].any(-1)
+    assert not received["belief", "log_likelihood"][nothing].any()

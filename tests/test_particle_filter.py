@@ -1,20 +1,197 @@
-"""The particle filter as a belief module: the shared requirements, its keys, its learning.
+"""The particle filter as a belief module, its networks, its noise and its mathematics.
 
-Its mathematics are in test_particles.py, its networks' laws in test_particle_networks.py, PPO's
-invariants with it in test_pipeline.py.
+PPO's invariants with it: test_pipeline.py.
 """
 
-from __future__ import annotations
+from typing import Any
 
 import pytest
 import torch
 from contracts import ACTION, OBS, BeliefModuleContract
-from particle_tools import HIDDEN, LATENT, OPTIONAL, K, make_filter, make_frames
-from tensordict import TensorDictBase
+from particle_tools import HIDDEN, LATENT, OPTIONAL, K, make_filter, make_frames, sample_noise
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.distributions import Normal
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn import ParticleFilterModule
+from torchrl_drbpn import ParticleFilter, ParticleFilterModule
+from torchrl_drbpn.functional import (
+    DiagonalGaussian,
+    ParticleNoise,
+    ParticleOutput,
+    ParticleStep,
+    ProposalOutput,
+    StateSpace,
+    effective_sample_size,
+    filter_sequence,
+    log_mean_weight,
+    particle_sequence,
+    resample,
+    systematic_ancestors,
+)
+from torchrl_drbpn.modules import particle_model
+
+
+def run(
+    filter: ParticleFilter, data: TensorDict, begin: Tensor | None = None
+) -> tuple[ParticleOutput, ParticleNoise]:
+    """Sequences from zeros, with the noise they were given."""
+    shape, count = data.shape, filter.num_particles
+    noise = sample_noise(shape, count, filter.latent_dim, 1)
+    hidden = torch.zeros(*shape, count, filter.hidden_dim, dtype=torch.float64)
+    begin = torch.zeros(shape, dtype=torch.bool) if begin is None else begin
+    parts = (data["previous_action"], data["observation"], data["observed"])
+    return filter(hidden, hidden[..., 0], begin, *parts, noise), noise
+
+
+def gru_cell(cell: torch.nn.GRUCell, x: Tensor, hidden: Tensor) -> Tensor:
+    flat = cell(x.reshape(-1, x.shape[-1]), hidden.reshape(-1, hidden.shape[-1]))
+    return flat.reshape(hidden.shape)
+
+
+def by_hand(
+    filter: ParticleFilter, hidden: Tensor, frame: TensorDict, epsilon: Tensor
+) -> tuple[Tensor, ...]:
+    """One particle, one step, network by network: log q, log p(z), log p(x | z), h, embedding."""
+    x, m = frame["observation"], frame["observed"]
+    seen = filter.encoder(torch.cat([x, m.double()], -1))
+    action = filter.action_encoder(frame["previous_action"])
+
+    def normal(raw: Tensor, floor: float) -> Normal:
+        mean, spread = raw.chunk(2, -1)
+        return Normal(mean, (torch.nn.functional.softplus(spread) + floor**2).sqrt())
+
+    proposed = filter.proposal(torch.cat([hidden, seen, action], -1)).relu()
+    moved = filter.transition(torch.cat([hidden, action], -1)).relu()
+    q = normal(filter.proposal_head(proposed), filter.latent_min_std)
+    p = normal(filter.transition_head(moved), filter.latent_min_std)
+    z = q.loc + q.scale * epsilon
+    phi = filter.latent_encoder(z)
+    decoded = filter.decoder(filter.emission(torch.cat([hidden, phi, action], -1)).relu())
+    sensors = normal(filter.emission_head(decoded), filter.min_std)
+    memory = gru_cell(filter.memory, torch.cat([phi, seen, action], -1), hidden)
+    seen_density = torch.where(m, sensors.log_prob(x), 0.0).sum(-1)
+    return q.log_prob(z).sum(-1), p.log_prob(z).sum(-1), seen_density, memory, phi
+
+
+def test_one_particle_is_the_sequential_variational_bound():
+    filter = make_filter(dtype=torch.float64, num_particles=1)
+    data = make_frames((3, 6))
+    out, noise = run(filter, data)
+    hidden, expected, features = torch.zeros(3, HIDDEN, dtype=torch.float64), [], []
+    for t in range(6):
+        log_q, log_p, seen, hidden, phi = by_hand(
+            filter, hidden, data[:, t], noise.proposal[:, t, 0]
+        )
+        expected.append(seen + log_p - log_q)
+        weight = torch.ones(3, 1, dtype=torch.float64)
+        features.append(filter.aggregator(torch.cat([hidden, phi, weight], -1)))
+    torch.testing.assert_close(out.log_likelihood, torch.stack(expected, 1))
+    torch.testing.assert_close(filter.features(out), torch.stack(features, 1))
+    # and so are its gradients
+    received = torch.autograd.grad(out.log_likelihood.sum(), filter.encoder.parameters())
+    by_steps = torch.autograd.grad(torch.stack(expected).sum(), filter.encoder.parameters())
+    torch.testing.assert_close(received, by_steps)
+
+
+def test_many_particles_are_each_by_hand_over_a_resampled_memory():
+    filter = make_filter(dtype=torch.float64)
+    data = make_frames((2, 4))
+    out, noise = run(filter, data)
+    hidden = torch.zeros(2, K, HIDDEN, dtype=torch.float64)
+    log_weight = torch.zeros(2, K, dtype=torch.float64)
+    died = 0
+    for t in range(4):
+        frame = data[:, t].unsqueeze(-1).expand(2, K)
+        ancestors = systematic_ancestors(log_weight, noise.resampling[:, t])
+        died += (ancestors != torch.arange(K)).sum().item()
+        hidden = torch.stack([hidden[b, ancestors[b]] for b in range(2)])
+        log_q, log_p, seen, hidden, phi = by_hand(filter, hidden, frame, noise.proposal[:, t])
+        log_weight = seen + log_p - log_q
+        torch.testing.assert_close(out.hidden[:, t], hidden)
+        torch.testing.assert_close(out.log_weight[:, t], log_weight)
+        torch.testing.assert_close(out.log_likelihood[:, t], log_weight.exp().mean(-1).log())
+        each = torch.cat([hidden, phi, log_weight.softmax(-1).unsqueeze(-1)], -1)
+        features = torch.zeros(2, HIDDEN, dtype=torch.float64)
+        for k in range(K):
+            features = gru_cell(filter.aggregator, each[:, k], features)
+        torch.testing.assert_close(filter.features(out)[:, t], features)
+    assert died  # resampling did something
+
+
+def test_nothing_observed_leaves_the_ratio_of_transition_and_proposal_and_the_mask_is_read():
+    filter = make_filter(dtype=torch.float64, num_particles=1)
+    data = make_frames((3, 5))
+    data["observed"][:] = False
+    data["observation"][:] = torch.nan
+    out, noise = run(filter, data)
+    assert all(part.isfinite().all() for part in out)
+    data["observation"][:] = 0.0
+    hidden = torch.zeros(3, HIDDEN, dtype=torch.float64)
+    for t in range(5):
+        log_q, log_p, seen, hidden, _ = by_hand(filter, hidden, data[:, t], noise.proposal[:, t, 0])
+        assert not seen.any()
+        torch.testing.assert_close(out.log_likelihood[:, t], log_p - log_q)
+    # a zero that arrived is not a zero that did not
+    data["observed"][..., 0] = True
+    assert not torch.allclose(run(filter, data)[0].hidden, out.hidden)
+
+
+def test_variances_never_fall_under_their_floor():
+    filter = make_filter(dtype=torch.float64, min_std=0.5, latent_min_std=0.1)
+    with torch.no_grad():
+        for head in (filter.emission_head, filter.proposal_head, filter.transition_head):
+            head.bias[head.out_features // 2 :] = -1e3
+    shared = (torch.randn(2, 5).double(), torch.randn(2, 3).double())
+    networks = particle_model._Networks(filter)
+    hidden = torch.zeros(2, K, HIDDEN, dtype=torch.float64)
+    proposed = networks.propose(hidden, shared)
+    outcome = networks.step(proposed.proposal.mean, hidden, shared)
+    for gaussian, floor in (
+        (proposed.proposal, 0.1),
+        (proposed.transition, 0.1),
+        (outcome.emission, 0.5),
+    ):
+        torch.testing.assert_close(gaussian.variance, torch.full_like(gaussian.mean, floor**2))
+
+
+def noise_of(data: TensorDict, age: int = 0, **kwargs: Any) -> ParticleNoise:
+    filter = make_filter(dtype=torch.float64, **kwargs)
+    ages = torch.full((*data.shape, 1), age)
+    return filter.noise(data["previous_action"], data["observation"], data["observed"], ages)
+
+
+def test_a_step_has_one_noise_in_either_dtype_and_another_step_another():
+    data, state = make_frames((50,)), torch.get_rng_state()
+    for key in ("observation", "previous_action"):
+        data[key] = data[key].float()
+    noise = noise_of(data)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert all(map(torch.equal, noise, noise_of(data.double().set("observed", data["observed"]))))
+    changed = [noise_of(data, age=1), noise_of(data, noise_seed=1)]
+    for key in ("observation", "previous_action"):
+        other = data.clone()
+        other[key] += 1e-3
+        changed.append(noise_of(other.set("observed", torch.ones_like(data["observed"]))))
+    for one in changed:
+        for new, old in zip(one, noise, strict=True):
+            assert not (new == old).flatten(1).all(1).any()
+
+
+def test_the_noise_is_normal_uniform_and_uncorrelated():
+    noise = noise_of(make_frames((4000,)), num_particles=2, latent_dim=2)
+    z = noise.proposal.flatten(1)
+    assert z.mean(0).abs().max() < 4 / 4000**0.5
+    assert (z.std(0) - 1).abs().max() < 4 / 8000**0.5
+    both = torch.cat([z, noise.resampling], -1)
+    assert (torch.corrcoef(both.mT) - torch.eye(5)).abs().max() < 4.5 / 4000**0.5
+    rows = torch.stack([z[:-1, 0], z[1:, 0]])
+    assert torch.corrcoef(rows)[0, 1].abs() < 4 / 4000**0.5
+    ordered = noise.resampling.flatten().sort().values
+    grid = (torch.arange(4000) + 0.5) / 4000
+    assert (ordered - grid).abs().max() < 2 / 4000**0.5  # Kolmogorov and Smirnov
+    assert ordered[0] >= 0
+    assert ordered[-1] < 1
 
 
 class TestContract(BeliefModuleContract):
@@ -67,3 +244,101 @@ def test_optional_entries_are_written_where_asked_for(over_time):
 def test_a_wrong_size_is_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_filter(**kwargs)
+
+
+def test_the_mean_weight_survives_weights_that_underflow():
+    log_weight = torch.tensor([-2000.0, -2000.0], dtype=torch.float64)
+    assert log_mean_weight(log_weight).item() == pytest.approx(-2000)
+    assert effective_sample_size(log_weight).item() == pytest.approx(2)
+
+
+def test_systematic_resampling_gives_each_particle_its_share_rounded_and_on_average_exactly():
+    g = torch.Generator().manual_seed(0)
+    log_weight = torch.randn(7, generator=g, dtype=torch.float64)
+    uniform = (torch.arange(2000, dtype=torch.float64) + 0.5).unsqueeze(-1) / 2000
+    ancestors = systematic_ancestors(log_weight.expand(2000, 7), uniform)
+    share = 7 * log_weight.softmax(-1)
+    offspring = torch.nn.functional.one_hot(ancestors, 7).sum(-2).double()
+    assert (offspring >= share.floor()).all()
+    assert (offspring <= share.ceil()).all()
+    torch.testing.assert_close(offspring.mean(0), share, rtol=0, atol=2e-3)
+
+
+def test_equal_weights_keep_every_particle_and_a_zero_weight_none():
+    uniform = torch.tensor([[0.01], [0.5], [0.99]])
+    assert systematic_ancestors(torch.zeros(3, 8), uniform).eq(torch.arange(8)).all()
+    log_weight = torch.zeros(3, 4)
+    log_weight[:, [0, 3]] = -torch.inf
+    assert systematic_ancestors(log_weight, uniform).tolist() == [[1, 1, 2, 2]] * 3
+
+
+def test_the_gradient_goes_to_the_ancestors_and_not_through_their_choice():
+    values = torch.arange(3.0).unsqueeze(-1).requires_grad_()
+    log_weight = torch.tensor([0.0, -torch.inf, 0.0], requires_grad=True)
+    ancestors = systematic_ancestors(log_weight, torch.tensor([0.5]))
+    resample(values, ancestors).sum().backward()
+    assert values.grad.flatten().tolist() == ancestors.bincount(minlength=3).tolist()
+    assert log_weight.grad is None
+
+
+class LinearGaussian:
+    """z = A h + B a + N(0, Q), x = c z + N(0, R), all diagonal but A; h is z itself.
+
+    The proposal is the transition widened.
+    """
+
+    def __init__(self) -> None:
+        g = torch.Generator().manual_seed(3)
+        self.A = 0.5 * torch.randn(3, 3, generator=g, dtype=torch.float64)
+        self.B = torch.randn(3, 2, generator=g, dtype=torch.float64)
+        self.Q, self.R, self.c = 0.2 + torch.rand(3, 3, generator=g, dtype=torch.float64)
+
+    def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:
+        mean = hidden @ self.A.mT + inputs[0].unsqueeze(-2) @ self.B.mT
+        variance = self.Q.expand_as(mean)
+        return ProposalOutput(
+            DiagonalGaussian(mean, 1.5 * variance), DiagonalGaussian(mean, variance)
+        )
+
+    def step(self, latent: Tensor, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ParticleStep:
+        del hidden, inputs
+        emission = DiagonalGaussian(self.c * latent, self.R.expand_as(latent))
+        return ParticleStep(emission, latent, latent)
+
+    def run(self, data: tuple[Tensor, ...], particles: int, seeds: int) -> Tensor:
+        """Log-likelihood of the rows of `data`, (seeds, rows, time)."""
+        x, m, action = (part.expand(seeds, *part.shape) for part in data)
+        noise = sample_noise(x.shape[:-1], particles, 3, particles)
+        hidden = x.new_zeros(*x.shape[:-1], particles, 3)
+        begin = torch.zeros(x.shape[:-1], dtype=torch.bool)
+        return particle_sequence(
+            self, hidden, hidden[..., 0], begin, (action,), x, m, noise
+        ).log_likelihood
+
+    def kalman(self, data: tuple[Tensor, ...]) -> Tensor:
+        """The same from the filter that carries the covariance along, (rows, time)."""
+        x, m, action = data
+        zero, start = x.new_zeros(3, 2), x.new_zeros(len(x), 3)
+        model = StateSpace(
+            lambda s, a: s @ self.A.mT + a @ self.B.mT, self.Q.diag(), self.c.diag(), self.R, zero,
+            zero[:, 0], zero[:, 0], self.Q.diag(), self.A,
+        )  # fmt: skip
+        reset, cov = torch.zeros(x.shape[:2], dtype=torch.bool), x.new_zeros(len(x), 3, 3)
+        return filter_sequence(model, start, action, x, m, reset, cov=cov).log_likelihood
+
+
+def linear_data(rows: int, time: int) -> tuple[Tensor, ...]:
+    g = torch.Generator().manual_seed(5)
+    m = torch.rand(rows, time, 3, generator=g) < 0.7
+    x, action = torch.randn(2, rows, time, 3, generator=g, dtype=torch.float64)
+    return torch.where(m, x, 0.0), m, action[..., :2]
+
+
+def test_the_likelihood_is_unbiased_on_a_linear_gaussian_system():
+    data = linear_data(rows=3, time=4)
+    system = LinearGaussian()
+    seeds = 4000
+    ratio = (system.run(data, 5, seeds).sum(-1) - system.kalman(data).sum(-1)).exp()
+    error = ratio.std(0) / seeds**0.5
+    assert (error < 0.05).all()  # or the next line would allow anything
+    assert ((ratio.mean(0) - 1).abs() < 3 * error).all()

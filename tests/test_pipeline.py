@@ -1,7 +1,5 @@
 """Belief modules in a GRU's place: TorchRL's collector, GAE and ClipPPOLoss, one code for all."""
 
-from __future__ import annotations
-
 import functools
 
 import pytest
@@ -16,11 +14,12 @@ from small_agents import (
     Agent,
     collect,
     make_agent,
-    make_env,
     make_filter,
     make_gae,
 )
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase, pad
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torchrl.envs.utils import step_mdp
 from torchrl.modules import GRUModule, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
@@ -28,24 +27,24 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss, ParticleFilterModule
 
-DTYPE = torch.float32
+DTYPE, HIDDEN = torch.float32, 6
 
 
-def gru() -> GRUModule:
+def gru(**kwargs) -> GRUModule:
     return GRUModule(
         input_size=OBS,
-        hidden_size=6,
+        hidden_size=HIDDEN,
         in_keys=["observation", "recurrent_state", "is_init"],
         out_keys=["features", ("next", "recurrent_state")],
     )
 
 
-def belief_filter() -> BeliefFilterModule:
-    return BeliefFilterModule(make_filter(OBS, ACTION, DTYPE, state=6))
+def belief_filter(**kwargs) -> BeliefFilterModule:
+    return BeliefFilterModule(make_filter(OBS, ACTION, DTYPE, state=HIDDEN), **kwargs)
 
 
-def particle_filter() -> ParticleFilterModule:
-    return ParticleFilterModule(make_particles(OBS, ACTION))
+def particle_filter(**kwargs) -> ParticleFilterModule:
+    return ParticleFilterModule(make_particles(OBS, ACTION), **kwargs)
 
 
 EVERY = pytest.mark.parametrize("make_module", [gru, belief_filter, particle_filter])
@@ -55,7 +54,7 @@ EVERY = pytest.mark.parametrize("make_module", [gru, belief_filter, particle_fil
 def agent_and_rollout(make_module) -> tuple[Agent, TensorDictBase]:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        agent = make_agent(make_module(), 6, dtype=DTYPE)
+        agent = make_agent(make_module(), HIDDEN, dtype=DTYPE)
     return agent, collect(agent, dtype=DTYPE)
 
 
@@ -104,12 +103,39 @@ def test_gae_reads_the_values_of_stored_and_next_beliefs(make_module, shifted):
     torch.testing.assert_close(through["value_target"], target, rtol=limit, atol=limit * scale)
 
 
-def test_without_its_primer_the_filter_says_so_where_a_gru_is_silent():
-    agent = make_agent(belief_filter(), 6, dtype=DTYPE)
-    with pytest.warns(UserWarning, match=r"make_tensordict_primer\(\)"), torch.no_grad():
-        data = make_env(DTYPE).rollout(4, agent.policy, break_when_any_done=False)
-    # nothing is remembered: every step starts from the initial belief
-    with set_recurrent_mode(False), torch.no_grad():
-        step = data[:, 2].select("observation", "observed", "previous_action", "is_init")
-        alone = agent.belief(step)["features"]
-    assert torch.equal(alone, data["features"][:, 2])
+# What TorchRL's own tests ask of GRUModule, asked of all three.
+BARE = {"in_keys": {"observed": None, "previous_action": None}}
+without_a_primer = pytest.mark.filterwarnings("ignore:.*make_tensordict_primer:UserWarning")
+
+
+def frames(*shape: int) -> TensorDict:
+    value, is_init = torch.ones(*shape, OBS).cumsum(-2), torch.zeros(*shape, 1, dtype=torch.bool)
+    return TensorDict({"observation": value, "is_init": is_init}, shape)
+
+
+@without_a_primer
+@EVERY
+def test_padded_data_are_taken(make_module):
+    padded = pad(frames(3), [0, 5])
+    assert make_module(**BARE)(padded)["features"].shape == (8, HIDDEN)
+
+
+@without_a_primer
+@pytest.mark.parametrize("over_time", [False, True])
+def test_vmap_over_stacked_parameters_is_a_loop(over_time):
+    # PyTorch's fused GRU, in GRUModule and over particles, has no batching rule
+    embed = TensorDictModule(nn.Linear(OBS, OBS), ["raw"], ["observation"])
+    head = TensorDictModule(nn.Linear(HIDDEN, 2), ["features"], ["out"])
+    model = TensorDictSequential(embed, belief_filter(**BARE), head)
+    data = frames(5, 6).rename_key_("observation", "raw")
+    data["is_init"][1, 3] = True
+    params = TensorDict.from_module(model).detach()
+    stacked = torch.stack([params, params * 0.9])
+
+    def call(data, params):
+        with set_recurrent_mode(over_time), params.to_module(model):
+            return model(data.clone())["out"]
+
+    received = torch.vmap(call, (None, 0))(data, stacked)
+    expected = torch.stack([call(data, part) for part in stacked.unbind(0)])
+    torch.testing.assert_close(received, expected, rtol=1e-4, atol=1e-5)

@@ -1,9 +1,8 @@
 """PolicyStep: one decision on plain tensors."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from filter_problems import make_model
 from tensordict import TensorDict
 from torch import nn
 
@@ -16,43 +15,20 @@ from torchrl_drbpn import (
 )
 from torchrl_drbpn.modules import MaskedObservationNorm
 
-ACTION, BATCH, TIME = 2, 3, 12
-
-
-def perturbed(module: nn.Module) -> nn.Module:
-    """Move every parameter away from where it starts."""
-    g = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for p in module.parameters():
-            p += 0.1 * torch.randn(p.shape, generator=g, dtype=p.dtype)
-    return module
+OBS, ACTION, BATCH, TIME = 5, 2, 3, 12
 
 
 def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float64, **keys):
     """A belief module of one kind, and a head of one hidden layer."""
-    obs, state = {"information": (9, 4), "free": (3, 4)}.get(kind, (4, 4))
-    transition, emission = None, None
-    if kind == "network":
-        transition = GaussianTransition(state, ACTION, cov_network=True, dtype=dtype)
-    if kind == "full":
-        transition = GaussianTransition(state, ACTION, cov="full", activation="tanh", dtype=dtype)
-        emission = LinearGaussianEmission(obs, state, ACTION, cov="full", dtype=dtype)
+    belief = BeliefFilterModule(make_model(kind, dtype), policy_input=policy_input, **keys)
     torch.manual_seed(0)
-    options = {"transition": transition, "emission": emission, "dtype": dtype}
-    if kind in ("propagated", "row"):
-        options |= {"covariance": "propagated", "jacobian": "row" if kind == "row" else "mean"}
-    belief = BeliefFilterModule(
-        BeliefFilter(obs, ACTION, state, **options),
-        policy_input=policy_input,
-        **keys,
-    )
     layers = nn.Linear(belief.feature_dim, 8, dtype=dtype), nn.Linear(8, ACTION, dtype=dtype)
-    return perturbed(belief), perturbed(nn.Sequential(layers[0], nn.Tanh(), layers[1]))
+    return belief, nn.Sequential(layers[0], nn.Tanh(), layers[1])
 
 
 def first_step(belief: BeliefFilterModule):
     """The arguments of a PolicyStep at the first step of an episode."""
-    observation, observed, is_init = (x[0] for x in inputs(belief.filter.obs_dim))
+    observation, observed, is_init = (x[0] for x in inputs(OBS))
     action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
     state = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
     return [observation, observed, action, is_init, *state]
@@ -70,46 +46,37 @@ def inputs(obs: int, dtype: torch.dtype = torch.float64, seed: int = 0):
     return observation, observed, is_init
 
 
-def run_step(step: PolicyStep, obs: int):
+def run(step, belief: BeliefFilterModule):
     """Act through the steps; the state is put back to zero where an episode starts."""
-    observation, observed, is_init = inputs(obs)
-    mean, age, *cov = step.initial_state(BATCH)
-    action = torch.zeros(BATCH, ACTION, dtype=mean.dtype)
-    out = []
-    for t in range(TIME):
-        fresh = is_init[t]
+    mean, age, *cov = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
+    action, out = torch.zeros(BATCH, ACTION, dtype=mean.dtype), []
+    for observation, observed, fresh in zip(*inputs(OBS), strict=True):
         mean, age = torch.where(fresh, 0.0, mean), torch.where(fresh, 0, age)
         action = torch.where(fresh, 0.0, action)
-        given = (observation[t], observed[t], action, fresh, mean, age, *cov)
-        _, mean, age, action, rejected, *cov = step(*given)
+        _, mean, age, action, rejected, *cov = step(
+            observation, observed, action, fresh, mean, age, *cov
+        )
         assert not rejected.any()
         out.append(torch.cat([action, mean], -1))
     return torch.stack(out), age
 
 
-def run_module(belief: BeliefFilterModule, head: nn.Module, norm: nn.Module | None = None):
-    """The same through keys."""
-    observation, observed, is_init = inputs(belief.filter.obs_dim)
-    mean, age, *cov = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
-    action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
-    out = []
-    for t in range(TIME):
-        fresh = is_init[t]
-        mean, age = torch.where(fresh, 0.0, mean), torch.where(fresh, 0, age)
+def through_keys(belief: BeliefFilterModule, head: nn.Module, norm: nn.Module | None = None):
+    """A step like that of PolicyStep, by the modules and their keys."""
+
+    @torch.no_grad()
+    def step(observation, observed, action, fresh, mean, age, *cov):
         data = TensorDict(
-            observation=observation[t], observed=observed[t], is_init=fresh,
-            previous_action=torch.where(fresh, 0.0, action), recurrent={"mean": mean, "age": age},
+            observation=observation, observed=observed, is_init=fresh, previous_action=action,
+            recurrent={"mean": mean, "age": age} | ({"cov": cov[0]} if cov else {}),
             batch_size=[BATCH],
         )  # fmt: skip
-        if cov:
-            data["recurrent", "cov"] = cov[0]
-        with torch.no_grad():
-            belief(data if norm is None else norm(data))
-            action = head(data["features"])
-        mean, age = data["next", "recurrent", "mean"], data["next", "recurrent", "age"]
-        cov = [data["next", "recurrent", "cov"]] if cov else []
-        out.append(torch.cat([action, mean], -1))
-    return torch.stack(out), age
+        belief(data if norm is None else norm(data))
+        after = data["next", "recurrent"]
+        cov = [after["cov"]] if cov else []
+        return None, after["mean"], after["age"], head(data["features"]), 0 * age, *cov
+
+    return step
 
 
 @pytest.mark.parametrize("policy_input", ["mean", "mean_cov"])
@@ -121,8 +88,8 @@ def test_a_step_equals_the_tensordict_policy(kind, policy_input):
     step = PolicyStep(belief, head)
     assert step.information is (kind == "information")
     assert step.constant is (kind != "network")
-    ours, our_age = run_step(step, belief.filter.obs_dim)
-    expected, age = run_module(belief, head)
+    ours, our_age = run(step, belief)
+    expected, age = run(through_keys(belief, head), belief)
     torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-10)
     assert torch.equal(our_age, age)
 
@@ -201,20 +168,23 @@ def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
 
 def test_a_normalised_policy_is_one_step_with_its_statistics():
     belief, head = make("innovation", in_key="normalized_observation")
-    norm, (observation, observed, _) = MaskedObservationNorm(4), inputs(4)
+    norm, (observation, observed, _) = MaskedObservationNorm(OBS), inputs(OBS)
     rollout = TensorDict(observation=3 * observation + 5, observed=observed)
     rollout.batch_size = [TIME, BATCH]
     norm.update(rollout)
     step = PolicyStep(belief, head, norm=norm)
-    expected, _ = run_module(belief, head, norm)
-    assert not torch.allclose(run_step(PolicyStep(belief, head), 4)[0], expected)
+    expected, _ = run(through_keys(belief, head, norm), belief)
+    assert not torch.allclose(run(PolicyStep(belief, head), belief)[0], expected)
     # a frozen copy: what is learned afterwards does not reach it
     norm.update(rollout)
-    other = PolicyStep(perturbed(belief), perturbed(head), norm=norm)
-    torch.testing.assert_close(run_step(step, 4)[0], expected, rtol=1e-9, atol=1e-10)
+    with torch.no_grad():
+        for parameter in (*belief.parameters(), *head.parameters()):
+            parameter += 0.1
+    other = PolicyStep(belief, head, norm=norm)
+    torch.testing.assert_close(run(step, belief)[0], expected, rtol=1e-9, atol=1e-10)
     assert not any(p.requires_grad for p in step.parameters())
     other.load_state_dict(step.state_dict())
-    assert torch.equal(run_step(other, 4)[0], run_step(step, 4)[0])
+    assert torch.equal(run(other, belief)[0], run(step, belief)[0])
 
 
 @pytest.mark.parametrize("normed", [False, True])
@@ -222,7 +192,7 @@ def test_a_normalised_policy_is_one_step_with_its_statistics():
 @pytest.mark.parametrize("kind", ["innovation", "information", "network"])
 def test_a_reading_that_is_not_finite_counts_as_missing_and_is_counted(kind, junk, normed):
     belief, head = make(kind)
-    norm = MaskedObservationNorm(belief.filter.obs_dim) if normed else None
+    norm = MaskedObservationNorm(OBS) if normed else None
     step = PolicyStep(belief, head, norm=norm)
     observation, observed, *rest = first_step(belief)
     *clean, none = step(observation, observed, *rest)
@@ -252,7 +222,7 @@ def test_limits_clip_the_action_and_not_what_is_fed_back():
     assert torch.equal(clipped, action.clamp(-0.05, 0.05))
     assert torch.equal(chosen, action)
     # the belief of an episode is that of the policy that was trained, which knows no limits
-    torch.testing.assert_close(run_step(limited, 4)[0], run_module(belief, head)[0])
+    torch.testing.assert_close(run(limited, belief)[0], run(through_keys(belief, head), belief)[0])
     with pytest.raises(ValueError, match="given together"):
         PolicyStep(belief, head, action_low=-high)
     with pytest.raises(TypeError, match="`belief` must be a BeliefFilterModule"):
@@ -261,7 +231,7 @@ def test_limits_clip_the_action_and_not_what_is_fed_back():
 
 def test_a_missing_covariance_is_named():
     belief, head = make("propagated")
-    with pytest.raises(ValueError, match=r"`cov` must have shape \(3, 4, 4\) here.*got None"):
+    with pytest.raises(ValueError, match=r"`cov` must have shape \(3, 5, 5\) here.*got None"):
         PolicyStep(belief, head)(*first_step(belief)[:6])
 
 
@@ -280,7 +250,7 @@ def test_a_tensor_of_another_width_or_batch_is_refused_and_not_broadcast(place, 
 def test_export_takes_it_with_any_batch(kind):
     belief, head = make(kind)
     limit = torch.full((ACTION,), 0.05, dtype=torch.float64)
-    norm = MaskedObservationNorm(belief.filter.obs_dim)
+    norm = MaskedObservationNorm(OBS)
     step = PolicyStep(belief, head, norm=norm, action_low=-limit, action_high=limit)
     args = tuple(first_step(belief))
     args[0][0, 0] = torch.nan

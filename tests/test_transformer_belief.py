@@ -1,11 +1,7 @@
 """What the transformer belief remembers, for how long, and what its attention computes.
 
-Attention is that of `nn.MultiheadAttention`. A layer sees k steps of the episode, no more and no
-less, by their distance and not by where a rollout was cut; the stored memory is its inputs, as far
-as they are valid. That steps equal sequences over whole rollouts stands in test_recipe_beliefs.py.
+That steps equal sequences over whole rollouts stands in test_recipe_beliefs.py.
 """
-
-from __future__ import annotations
 
 import pytest
 import torch
@@ -65,7 +61,6 @@ def band(time: int, steps: int) -> Tensor:
     return (distance >= 0) & (distance <= steps)
 
 
-# --- attention
 def test_attention_is_that_of_torch_with_positions_added_to_the_keys():
     from beliefs.transformer import MemoryAttention
 
@@ -103,7 +98,6 @@ def test_attention_is_that_of_torch_with_positions_added_to_the_keys():
         torch.testing.assert_close(ours_grad, theirs_grad)
 
 
-# --- the window
 @pytest.mark.parametrize(("window", "layers"), [(1, 2), (4, 1), (3, 2)])
 def test_features_depend_on_as_many_steps_as_the_layers_reach_back(window, layers):
     module = make_module(window=window, layers=layers)
@@ -111,7 +105,6 @@ def test_features_depend_on_as_many_steps_as_the_layers_reach_back(window, layer
     assert torch.equal(reach(module, make_frames(2, 9)), expected)
 
 
-# --- episodes
 def test_an_episode_start_hides_what_lay_before():
     module = make_module(layers=2)
     frames = make_frames(2, 9)
@@ -135,7 +128,6 @@ def test_an_episode_start_hides_the_stored_memory():
     assert not torch.isclose(gone_on["features"], fresh["features"]).all(-1).any()
 
 
-# --- the memory
 def test_what_lies_beyond_the_length_of_the_memory_counts_for_nothing():
     module = make_module(window=6, layers=2)
     frames = make_frames(2, 4).update(in_steps(module, make_frames(2, 4)).select("recurrent"))
@@ -179,7 +171,6 @@ def test_no_gradient_flows_into_the_memory():
         assert not out["next", *MEMORY].requires_grad
 
 
-# --- sizes
 @pytest.mark.parametrize(
     "sizes", [{"window": 0}, {"layers": 0}, {"heads": 0}, {"width": 0}, {"heads": 3}]
 )
