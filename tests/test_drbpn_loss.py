@@ -1,7 +1,5 @@
 """What `DRBPNLoss` is held to: a loss's duties, and eq. (13) [DRBPN] from one filter pass."""
 
-from __future__ import annotations
-
 import functools
 
 import oracles
@@ -110,18 +108,6 @@ def test_one_pass_over_time_and_one_step_for_the_last_observations():
     with set_recurrent_mode(True):
         agent.belief(data)
     torch.testing.assert_close(out["loss_model"], -data["belief", "log_likelihood"])
-
-
-def test_what_the_collector_wrote_of_the_belief_is_not_read():
-    loss, data = make_loss(), make_data()
-    expected = loss(data)
-    stale = data.clone()
-    stale["features"].fill_(torch.nan)
-    for key in ("mean", "log_likelihood"):
-        stale["belief", key].fill_(torch.nan)
-    stale["next", "recurrent", "mean"].fill_(torch.nan)
-    out = loss(stale)
-    assert_identical(out, expected)
 
 
 @pytest.mark.slow
@@ -260,17 +246,6 @@ def test_every_received_observation_counts_once_however_the_rollout_is_cut(lengt
     assert counts == pytest.approx(entries, abs=1e-6)
 
 
-def test_final_adds_the_observation_after_the_cut_and_nothing_else():
-    agent, data = make_belief_agent(), make_data()
-    loss = make_loss(agent, model=BeliefModelLoss(reduction="none"))
-    each, without = (loss(d)["loss_model"] for d in (data, data.exclude("final")))
-    differs = ~torch.isclose(each, without, rtol=1e-9, atol=1e-9)
-    goes_on = ~data["next", "done"][:, -1, 0]
-    assert goes_on.any()
-    assert torch.equal(differs[:, -1], goes_on & data["next", "observed"][:, -1].any(-1))
-    assert not differs[:, :-1].any()
-
-
 @filters
 def test_the_next_observation_is_predicted_from_the_live_belief_with_its_gradient(covariance):
     agent, data = (make(torch.float64, covariance) for make in (make_belief_agent, make_data))
@@ -399,21 +374,6 @@ def test_a_norm_in_front_of_the_filter_scales_the_next_observation_too():
         norm(data["next"])
     for key, value in outs[1].items():
         torch.testing.assert_close(outs[0][key], value, msg=key)
-
-
-def test_the_parameters_are_those_of_the_modules():
-    agent, frame = make_belief_agent(), make_data()[:, 0]
-    loss = make_loss(agent)
-    parts = (agent.belief, agent.actor, agent.critic)
-    assert {*map(id, loss.parameters())} == {id(p) for part in parts for p in part.parameters()}
-    # an update of the loss's parameters reaches the collector's policy
-    outs = []
-    for _ in range(2):
-        outs.append(agent.policy(frame.select(*agent.policy.in_keys))["features"])
-        with torch.no_grad():
-            for parameter in loss.parameters():
-                parameter += 0.1
-    assert not torch.equal(*outs)
 
 
 @pytest.mark.parametrize(

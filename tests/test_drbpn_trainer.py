@@ -1,7 +1,5 @@
 """`DRBPNLoss` in TorchRL's own pipelines."""
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 

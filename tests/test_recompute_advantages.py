@@ -1,11 +1,8 @@
 """What the epochs of an update are cut from; optim.recompute_advantages."""
 
-from __future__ import annotations
-
 import pytest
 import recipe_tools  # noqa: F401 (the recipes become importable)
 import torch
-from contract_environments import saved
 from recipe_tools import assembled
 from training.reward_scale import ReturnStatistics, scale_reward
 
@@ -86,9 +83,6 @@ def test_a_belief_without_memory_learns_from_single_steps_and_the_last_of_a_roll
         assert not final[:, :-1].any()
 
 
-# Rewards over the running deviation of the discounted return -------------------------------------
-
-
 GAMMA = 0.9
 
 
@@ -116,17 +110,6 @@ def test_the_scale_is_the_deviation_of_all_returns_up_to_the_end_of_the_rollout(
     assert statistics.n == rewards.numel()
 
 
-def test_however_the_steps_are_cut_into_rollouts_the_last_scale_is_the_same():
-    rewards, dones = make_rollouts()
-    whole, dones = torch.cat(list(rewards), 1), torch.cat(list(dones), 1)
-    at_once = scale_reward(whole, dones, ReturnStatistics.start(2), gamma=GAMMA)[1]
-    statistics = ReturnStatistics.start(2)
-    for reward, done in zip(whole.split(5, 1), dones.split(5, 1), strict=True):
-        _, statistics = scale_reward(reward, done, statistics, gamma=GAMMA)
-    for a, b in zip(statistics, at_once, strict=True):
-        torch.testing.assert_close(a, b)
-
-
 def test_scaled_rewards_stay_within_the_clip():
     reward = torch.zeros(1, 400, 1)
     reward[0, 7] = -1.0
@@ -134,13 +117,3 @@ def test_scaled_rewards_stay_within_the_clip():
     scaled, _ = scale_reward(reward, done, ReturnStatistics.start(1), gamma=0.0, clip=2.0)
     assert scaled.amin() == -2.0
     assert scaled.dtype == reward.dtype
-
-
-def test_the_statistics_survive_a_file():
-    rewards, dones = make_rollouts()
-    statistics = scale_reward(rewards[0], dones[0], ReturnStatistics.start(2), gamma=GAMMA)[1]
-    restored = ReturnStatistics(**saved(statistics._asdict()))
-    for state in (statistics, restored):
-        scaled, _ = scale_reward(rewards[1], dones[1], state, gamma=GAMMA)
-        torch.testing.assert_close(scaled, rewards[1] * (scaled / rewards[1]).mean())
-    assert all(torch.equal(a, b) for a, b in zip(statistics, restored, strict=True))
