@@ -1,7 +1,5 @@
 """What the corrupting transforms promise beyond `test_transforms_requirements.py`."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 
@@ -69,24 +67,6 @@ def test_numbers_per_component_span_several_keys():
     assert after["b"][:, 1].std() > 50 > 5 > after["a"][:, 1].std()
 
 
-def test_keys_of_different_batch_are_no_vector():
-    nested = TensorDict({"observation": torch.ones(2, 3, OBS)}, [2, 3])
-    both = TensorDict({"agents": nested, "observation": torch.ones(2, OBS)}, [2])
-    transform = MISSING(in_keys=["observation", ("agents", "observation")])
-    with pytest.raises(ValueError, match=r"must share their batch .* \[\(2, 5\), \(2, 3, 5\)\]"):
-        transform._call(both)
-
-
-@pytest.mark.parametrize(
-    ("shape", "dtype"), [((), torch.float32), ((3, 8, 8), torch.float32), ((OBS,), torch.int64)]
-)
-@pytest.mark.parametrize("transform", [MISSING(), NOISE()], ids=["missingness", "noise"])
-def test_the_spec_of_an_observation_that_is_no_vector_of_floats_is_refused(transform, shape, dtype):
-    spec = Composite(observation=Unbounded(shape=(4, *shape), dtype=dtype), shape=(4,))
-    with pytest.raises(ValueError, match="`observation` must be a vector of floating point"):
-        transform.transform_observation_spec(spec)
-
-
 def existing_mask():
     mask = torch.ones(4, OBS, dtype=torch.bool)
     mask[:, 2] = False
@@ -101,15 +81,6 @@ def test_missing_entries_are_neither_changed_nor_filled(transform):
     assert torch.equal(after["observation"] != 0, existing_mask())
     assert torch.equal(after["observed"], existing_mask())
     assert torch.equal(after.get("hit", existing_mask()), existing_mask())
-
-
-def test_a_spiked_entry_has_arrived():
-    spikes = ObservationSpikes(1.0, 5.0, complete_key=COMPLETE, spiked_key="hit")
-    after = staircase(spikes, MISSING(), batch=20).reset()
-    arrived = after["observed"]
-    assert after["hit"].all()
-    assert 0 < arrived.double().mean() < 1
-    assert (after["observation"][arrived] != after[COMPLETE][arrived]).all()
 
 
 def test_infinite_values_are_errors_and_not_gaps():
@@ -138,25 +109,6 @@ def test_each_row_may_lack_sensors_of_its_own():
     assert after["observed"][1, 0]  # nor do rows share memory
     env = staircase(SensorReduction(rows), batch=4)
     assert torch.equal(env.rollout(3)["next", "observed"], (~rows).unsqueeze(1).expand(4, 3, OBS))
-
-
-@pytest.mark.parametrize("shape", [(3, OBS), (1, OBS), (2, 4, OBS)])
-def test_rows_for_another_batch_are_refused(shape):
-    rows = torch.zeros(shape, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"`missing` with a row .* = \(4, 5\), got"):
-        SensorReduction(rows)(data())
-    with pytest.raises(ValueError, match="`missing` must be a list of indices, or bool"):
-        SensorReduction(torch.zeros(shape, dtype=torch.int64))
-
-
-@pytest.mark.parametrize("missing", [[5], [-6], [True, False]])
-def test_sensors_that_do_not_exist_are_refused(missing):
-    with pytest.raises(ValueError, match="`missing` "):
-        _ = staircase(SensorReduction(missing)).observation_spec
-    with pytest.raises(ValueError, match="`missing` "):
-        SensorReduction(missing)(data())
-    with pytest.raises(ValueError, match="`missing` must be a list of indices"):
-        SensorReduction([0.5])
 
 
 def nested(first, second):
@@ -263,9 +215,34 @@ def test_numbers_are_finite_not_negative_and_as_many_as_components(make, name, n
             use()
 
 
+def use_keys_of_different_batch():
+    nested = TensorDict({"observation": torch.ones(2, 3, OBS)}, [2, 3])
+    both = TensorDict({"agents": nested, "observation": torch.ones(2, OBS)}, [2])
+    MISSING(in_keys=["observation", ("agents", "observation")])._call(both)
+
+
+def use_spec(transform, shape, dtype=torch.float32):
+    spec = Composite(observation=Unbounded(shape=(4, *shape), dtype=dtype), shape=(4,))
+    transform.transform_observation_spec(spec)
+
+
 @pytest.mark.parametrize(
     ("use", "error", "message"),
     [
+        (use_keys_of_different_batch, ValueError,
+         r"must share their batch .* \[\(2, 5\), \(2, 3, 5\)\]"),
+        *[(lambda make=make, spec=spec: use_spec(make(), *spec), ValueError,
+           "`observation` must be a vector of floating point")
+          for make in (MISSING, NOISE) for spec in (((),), ((3, 8, 8),), ((OBS,), torch.int64))],
+        *[(lambda shape=shape: SensorReduction(torch.zeros(shape).bool())(data()), ValueError,
+           r"`missing` with a row .* = \(4, 5\), got")
+          for shape in ((3, OBS), (1, OBS), (2, 4, OBS))],
+        (lambda: SensorReduction(torch.zeros(3, OBS).long()), ValueError,
+         "`missing` must be a list of indices, or bool"),
+        (lambda: SensorReduction([0.5]), ValueError, "`missing` must be a list of indices"),
+        *[(lambda m=m: SensorReduction(m)(data()), ValueError, "`missing` ")
+          for m in ([5], [-6], [True, False])],
+        (lambda: staircase(SensorReduction([5])).observation_spec, ValueError, "`missing` "),
         (lambda: ObservationSpikes(1.1, 1.0), ValueError, "`probability` must .* got 1.1"),
         (lambda: SPIKES(spiked_key="observed"), ValueError, "`spiked_key` must name keys of"),
         (lambda: staircase(SPIKES(spiked_key="hit"), SPIKES(spiked_key="hit")).reset(), ValueError,

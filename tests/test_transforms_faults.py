@@ -1,16 +1,16 @@
-"""The laws of late, rare, stuck and drifting readings."""
+"""The laws of late, rare, stuck, drifting and failing readings."""
 
-from __future__ import annotations
-
+import copy
 import math
 
 import pytest
 import torch
-from contracts import ACTION, OBS, staircase
+from contracts import ACTION, OBS, staircase, vectors
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import StepCounter
 
+from torchrl_drbpn.functional.missingness import outage_rates, sample_working
 from torchrl_drbpn.transforms import (
     ObservationDelay,
     ObservationMissingness,
@@ -38,27 +38,18 @@ def collected(*transforms, steps=40, batch=3, horizon=7):
     return data
 
 
-def ages(data):
-    """How many steps before its step each reading of a staircase was taken; 0 or more."""
-    return (data[COMPLETE] - data["observation"]).round().long()
-
-
-@pytest.mark.parametrize("delay", [0, 1, 4])
-def test_a_fixed_delay_shows_what_was_there_then_in_this_episode(delay):
-    data = collected(ObservationDelay(delay, complete_key=COMPLETE))
-    arrived = (data["step_count"] >= delay).expand(-1, -1, OBS)
+@pytest.mark.parametrize(
+    ("delay", "groups", "wanted"),
+    [(0, None, 0), (1, None, 1), (4, None, 4), ([1, 3], GROUPS, [1, 0, 0, 1, 3])],
+)
+def test_a_fixed_delay_shows_what_was_there_then_in_this_episode(delay, groups, wanted):
+    data = collected(ObservationDelay(delay, groups=groups, complete_key=COMPLETE))
+    wanted = torch.as_tensor(wanted)  # what is in no group is in time
+    arrived = (data["step_count"] >= wanted).expand(-1, -1, OBS)
     assert torch.equal(data["observed"], arrived)
     torch.testing.assert_close(
-        data["observation"], (data[COMPLETE] - delay).where(arrived, torch.tensor(0.0))
+        data["observation"], (data[COMPLETE] - wanted).where(arrived, torch.tensor(0.0))
     )
-
-
-def test_groups_have_delays_of_their_own_and_what_is_in_none_is_in_time():
-    data = collected(ObservationDelay([1, 3], groups=GROUPS, complete_key=COMPLETE))
-    wanted = torch.tensor([1, 0, 0, 1, 3])
-    assert torch.equal(data["observed"], data["step_count"] >= wanted)
-    seen = data["observed"]
-    assert torch.equal(ages(data)[seen], wanted.expand(seen.shape)[seen])
 
 
 @pytest.mark.parametrize("in_order", [False, True])
@@ -208,19 +199,6 @@ def test_a_drift_that_ends_is_calibrated_and_another_starts_at_zero():
     assert ended.any()
 
 
-def test_faults_come_on_top_of_each_other_and_masks_are_anded():
-    data = collected(
-        SensorDrift(0.1),
-        StuckSensors(0.2, 3),
-        ObservationMultiRate(2),
-        ObservationDelay(1),
-        SensorOutages(0.3, 4),
-    )
-    due = (data["step_count"] >= 1) & (data["step_count"] % 2 == 1)
-    assert torch.equal(data["observed"], due & data["sensor_on"])
-    assert (data["observation"][~data["observed"]] == 0).all()
-
-
 def test_a_state_that_got_lost_or_is_another_is_named():
     root = TensorDict({"action": torch.zeros(4, ACTION)}, [4])
     step = TensorDict({"observation": torch.ones(4, OBS)}, [4])
@@ -296,3 +274,73 @@ def test_numbers_and_groups_that_do_not_fit_the_observation_are_refused(transfor
         transform._reset(None, TensorDict({"observation": torch.ones(4, OBS)}, [4]))
     with pytest.raises(ValueError, match=line):
         staircase(transform).reset()
+
+
+@pytest.mark.parametrize("initial", ["stationary", "on"])
+def test_masks_follow_the_chain_and_every_episode_has_its_own_start(initial):
+    transform = SensorOutages(0.5, 3, initial=initial, seed=0)
+    env = staircase(transform)
+    generator = copy.copy(transform.generator(torch.device("cpu")))
+    rates, like = outage_rates(0.5, 3), torch.zeros(3, OBS)
+    rollout = env.rollout(9, break_when_any_done=False)
+    assert rollout["next", "done"].any(1).all()
+
+    def start() -> torch.Tensor:
+        if initial == "on":
+            return torch.ones(3, OBS, dtype=torch.bool)
+        return sample_working(None, rates, like, generator)
+
+    expected = start()
+    for t in range(9):
+        assert torch.equal(rollout["observed"][:, t], expected)
+        arrived = sample_working(expected, rates, like, generator)
+        assert torch.equal(rollout["next", "observed"][:, t], arrived)
+        over = rollout["next", "done"][:, t]
+        expected = arrived
+        if t < 8 and over.any():
+            expected = torch.where(over, start(), arrived)
+
+
+def test_writing_into_the_mask_does_not_repair_a_sensor():
+    after = SensorOutages(0.5, 5)._call(vectors(1.0, (50,)))
+    before = after["sensor_on"].clone()
+    after["observed"].fill_(True)
+    assert torch.equal(after["sensor_on"], before)
+
+
+def test_several_keys_are_one_vector_and_groups_reach_over_them():
+    both = TensorDict({"a": torch.ones(400, 2), "b": torch.ones(400, 3)}, [400])
+    outages = SensorOutages(
+        0.5, 5, groups=[[0, 2], [-1]], in_keys=["a", "b"], mask_keys=["ma", "mb"], state_key="on"
+    )
+    after = outages._call(both)
+    assert torch.equal(after["ma"][:, 0], after["on"][:, 0])
+    assert torch.equal(after["mb"][:, 0], after["on"][:, 0])
+    assert torch.equal(after["mb"][:, 2], after["on"][:, 1])
+    assert after["ma"][:, 1].all()
+    assert after["mb"][:, 1].all()
+    both = torch.stack([after["on"][:, 0], after["on"][:, 1]]).double()
+    assert torch.corrcoef(both)[0, 1].abs() < 4 / math.sqrt(both.shape[1])
+
+
+def test_a_nested_observation_has_mask_and_state_beside_it():
+    inner = TensorDict({"observation": torch.ones(2, 3, OBS)}, [2, 3])
+    outer = TensorDict({"agents": inner}, [2])
+    after = SensorOutages(0.5, 5, in_keys=[("agents", "observation")])._call(outer)
+    assert after["agents", "sensor_on"].shape == (2, 3, OBS)
+    assert after.get("sensor_on", None) is None
+
+
+def test_two_of_them_need_two_states():
+    with pytest.raises(ValueError, match=r"`sensor_on` is among .* Pass another key"):
+        _ = staircase(SensorOutages(0.2, 5), SensorOutages(0.2, 20)).observation_spec
+    env = staircase(
+        SensorOutages(0.2, 5),
+        SensorOutages(0.2, 20, groups=[[0, 1, 2, 3, 4]], state_key="bus_on"),
+        batch=500,
+        horizon=20,
+    )
+    rollout = env.rollout(10)
+    assert torch.equal(rollout["observed"], rollout["sensor_on"] & rollout["bus_on"])
+    # 1 - .8 * .8; a group is one draw for five entries
+    assert (1 - rollout["observed"].double().mean()) == pytest.approx(0.36, abs=0.05)

@@ -1,7 +1,5 @@
 """What the random transforms promise about seeds, steps, resets and states, and `seed_env`."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import math

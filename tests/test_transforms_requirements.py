@@ -1,13 +1,4 @@
-"""What every transform must do, each requirement once for all of them.
-
-TorchRL's own list for a transform (single, serial-trans, parallel-trans, trans-serial,
-trans-parallel, no env, compose, env, model, replay buffer, inverse), and on top: any leading batch
-shape, thousands of rows, float64 kept, meta device, the first observation of an episode treated
-like every other, partial resets that leave the other rows alone, a state that survives `torch.save`
-with `weights_only=True`, copies without a parent, one clear line for what is not an observation.
-"""
-
-from __future__ import annotations
+"""What every transform must do, each requirement once for all of them."""
 
 import copy
 import math

@@ -1,7 +1,5 @@
 """Every transform, and what it makes of an observation; see test_transforms_requirements.py."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
