@@ -1,8 +1,4 @@
-"""ACKTR behind the recipe's one path (`algo=acktr`).
-
-A rollout is learned from by natural-gradient steps: the value comes nearer to its targets, the
-divergence of the policy is steered to the one asked for. A stopped run goes on to the last bit.
-"""
+"""ACKTR behind the recipe's one path (`algo=acktr`)."""
 
 import shutil
 

@@ -1,9 +1,4 @@
-"""The benchmarks run, print what they should, and write their tables.
-
-Each command of `benchmarks/` ends well with --quick and writes JSON, the calibration example
-runs, and the ratio of two candidates comes from pairs of one round. Speed itself is not tested: a
-test that fails on a loaded machine tells nothing.
-"""
+"""The benchmarks run and write their tables; a test of speed would fail on a loaded machine."""
 
 import argparse
 import json

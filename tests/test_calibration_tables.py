@@ -1,8 +1,4 @@
-"""Tables of a diagnosis on data with known errors, and the scores of Gaussian predictions.
-
-Errors are sorted by the steps since a sensor was last seen; a belief that is right has a NIS of one
-and covers what it claims, a wrong one has not.
-"""
+"""Tables of a diagnosis on data with known errors, and the scores of Gaussian predictions."""
 
 import itertools
 import math

@@ -1,8 +1,4 @@
-"""The configuration: every choice composes and is built, every default is explained.
-
-What has a `_target_` takes exactly the keys that stand beside it. What a person gets wrong is
-answered with one line that names the setting, and the nearest one where there is none of that name.
-"""
+"""The configuration: every choice composes and is built, every default is explained."""
 
 import pytest
 from evaluation.points import missingness_kind, missingness_name

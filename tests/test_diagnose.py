@@ -1,10 +1,4 @@
-"""The diagnosis of beliefs.
-
-The steps since a sensor was last seen are those that a plain loop over the mask counts; what the
-tables make of them: test_calibration_tables.py. Whatever has an estimate of its
-sensors is asked for it by the same names, and what it writes is what it acts on. The command leaves
-tables and figures whole, the same bytes for the same seed, and answers bad input in one line.
-"""
+"""The diagnosis of beliefs; its tables on data with known errors: test_calibration_tables.py."""
 
 import shutil
 from typing import Any

@@ -1,9 +1,4 @@
-"""The evaluation recipe: episodes, the table that grows condition by condition.
-
-Every episode draws from a stream of its own, so that more episodes only add. The table holds whole
-conditions: one that was stopped goes on, to the same bytes as one that was not, and never mixes
-settings. Folders are found whatever their names hold.
-"""
+"""The evaluation recipe: episodes, the table that grows condition by condition, its folders."""
 
 import dataclasses
 import shlex

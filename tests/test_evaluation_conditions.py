@@ -1,7 +1,4 @@
-"""Conditions of an evaluation, and the sensors that are removed.
-
-A condition names one thing and leaves the rest as in training; its full name reads back to itself.
-"""
+"""Conditions of an evaluation, and the sensors that are removed."""
 
 from typing import Any
 

@@ -1,9 +1,4 @@
-"""One file for a robot: it decides as the agent does, whoever runs it.
-
-Specified here: every format gives the agent's actions, NaN and a False mask are the same; what can
-not be exported is one line and leaves no file; the programs of docs/deploy walk with an agent that
-was exported, in Python without TorchRL, without torch, and in C++.
-"""
+"""One file for a robot: it decides as the agent does, whoever runs it."""
 
 import ast
 import re

@@ -1,8 +1,4 @@
-"""A transform, a belief, a loss and a robot of one's own, from files elsewhere, as the pages say.
-
-Each command of the pages trains, from any directory and by the command line alone. The duties of
-every belief module hold for the pages' example.
-"""
+"""A transform, a belief, a loss and a robot from files elsewhere, as the pages say."""
 
 import os
 import re

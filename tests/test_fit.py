@@ -1,10 +1,4 @@
-"""Fitting the filter to logged data.
-
-Specified here: what is read is the log, whatever file it is in, and what can't be used is named in
-one line; windows, scales and hidden entries do what they claim on data made here; on a known linear
-system the fit comes close to the system's own likelihood and its intervals cover; the filter that
-is written is what an agent starts from.
-"""
+"""Fitting the filter to logged data: what is read, what is learned, what an agent starts from."""
 
 from pathlib import Path
 from typing import Any

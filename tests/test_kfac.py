@@ -1,9 +1,4 @@
-"""Kronecker-factored natural-gradient steps, held to Fisher matrices written out in float64.
-
-The factors of a linear layer give its exact Fisher matrix where inputs and scores are independent;
-the step solves with the damped matrix, moves no further than the trust region, and goes on from a
-saved state as if it had never stopped.
-"""
+"""Kronecker-factored natural-gradient steps, held to Fisher matrices written out in float64."""
 
 import itertools
 

@@ -1,11 +1,4 @@
-"""Films and pictures of an agent at work.
-
-A recording holds the truth, what arrived and the belief of the agent that is read back, all in one
-unit and step by step; it is the first episode of an evaluation. A film has as many frames as the
-episode and the options give, of the size asked for, written whole or not at all; every frame shows
-the mask and the gaps up to its step; the belief where there is one, the sensors alone where there
-is none. Pictures of the robot are needed by nothing else. Bad input is answered with one line.
-"""
+"""Films and pictures of an agent at work."""
 
 import dataclasses
 import importlib.util

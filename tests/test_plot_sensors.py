@@ -1,11 +1,4 @@
-"""What trained beliefs say about their sensors: `kept_sensors` and `recipes/plot_sensors.py`.
-
-Specified, on three Hopper runs of one rollout: the model that is read is the one the filter
-predicts with; the sensors kept are those of `select_sensors` and tell more than most random ones;
-what is drawn along any order is what the library's update leaves; rankings do not depend on the
-state's basis.
-The recipe writes two pictures and a table, whole, and answers bad input with one line.
-"""
+"""What trained beliefs say about their sensors: `kept_sensors` and `recipes/plot_sensors.py`."""
 
 import shutil
 from dataclasses import replace

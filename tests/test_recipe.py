@@ -1,9 +1,4 @@
-"""The training recipe as a person runs it.
-
-A run leaves a whole folder, one seed gives one result, an evaluation changes nothing in the
-training, and the agent learns. What stops a run: test_resume.py, test_run_folder.py and
-test_recipe_faults.py.
-"""
+"""The training recipe as a person runs it; what stops a run has files of its own."""
 
 import io
 import json

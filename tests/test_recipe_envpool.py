@@ -1,9 +1,4 @@
-"""The training recipe over EnvPool: `env.backend=envpool`.
-
-One seed gives one result. The simulators keep their state to themselves, so that a resumed run
-goes on with new episodes, says so in one line, and keeps everything else: weights, optimiser,
-statistics, counters. Without EnvPool the answer is one line.
-"""
+"""The training recipe over EnvPool, whose simulators keep their state to themselves."""
 
 import shutil
 import sys

@@ -1,7 +1,4 @@
-"""What goes wrong inside a run: numbers that are none, an environment that fails.
-
-It ends in one line that says at which step, and what was saved is good.
-"""
+"""What goes wrong inside a run ends in one line that says at which step; what was saved is good."""
 
 import re
 

@@ -1,9 +1,4 @@
-"""Reports: what the tables say of a few small runs, and that tables alone give the page again.
-
-Run folders have what a run leaves behind, with numbers that are easy to sum up. Statistics equal
-values by hand. Runs are averaged over seeds only; a mean that lacks a seed is not given. What a
-user gets wrong is one line.
-"""
+"""Reports of run folders with numbers that are easy to sum up; statistics equal values by hand."""
 
 import json
 import shutil

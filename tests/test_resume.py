@@ -1,7 +1,4 @@
-"""A run that was stopped, by a signal or by the machine, goes on as if it never had been.
-
-The tables and the last checkpoint equal those of a run that nobody stopped, to the last bit.
-"""
+"""A run that was stopped goes on as if it never had been, to the last bit."""
 
 import os
 import shutil

@@ -1,10 +1,4 @@
-"""Studies and methods: sweeps of Hydra whose cells are runs that can be killed at any moment.
-
-Every study and every method composes into runs without a key that no part reads. With the same
-settings a cell that is done is left as it is, one that was cut off goes on, one that was killed
-before its first checkpoint starts anew; other settings are refused. One that fails ends no other,
-whatever runs the cells: one after another, joblib, submitit.
-"""
+"""Studies and methods: sweeps of Hydra whose cells are runs that can be killed at any moment."""
 
 import contextlib
 import functools
