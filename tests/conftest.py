@@ -74,6 +74,21 @@ def drbpn(trained_run):
     return trained_run()
 
 
+@pytest.fixture(scope="module")
+def agent(drbpn):
+    from evaluation.trained import load_trained_agent
+
+    return load_trained_agent(drbpn)
+
+
+@pytest.fixture
+def young(drbpn, tmp_path):
+    """The folder of a run that has no checkpoint yet."""
+    (tmp_path / "young").mkdir()
+    shutil.copy(drbpn / "config.yaml", tmp_path / "young")
+    return tmp_path / "young"
+
+
 @pytest.fixture(scope="session")
 def feedforward(trained_run):
     return trained_run("none")

@@ -6,7 +6,6 @@ import pytest
 import torch
 from analysis.calibration import diagnose
 from evaluation.table import Protocol, evaluate_condition
-from evaluation.trained import load_trained_agent
 from evaluation_tools import diagnose as run_diagnosis
 from evaluation_tools import evaluate, parse
 from recipe_tools import read_table, refused
@@ -15,15 +14,10 @@ from training.config import explained
 from torchrl_drbpn import BeliefDivergedError, BeliefFilter, GymnasiumBatchEnv
 
 
-@pytest.fixture(scope="module")
-def trained(drbpn):
-    return load_trained_agent(drbpn)
-
-
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
-def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(trained, monkeypatch, value):
-    point, protocol = parse("mcar:0.5", trained.settings), Protocol(3, 1, 0, 1, None, 4.0)
-    expected = evaluate_condition(trained, point, ["sampled"], protocol).to_dict("records")
+def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(agent, monkeypatch, value):
+    point, protocol = parse("mcar:0.5", agent.settings), Protocol(3, 1, 0, 1, None, 4.0)
+    expected = evaluate_condition(agent, point, ["sampled"], protocol).to_dict("records")
     step, calls, actions = BeliefFilter.step, [], []
 
     def diverge(self, *args, **options):
@@ -40,7 +34,7 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(trained, monkey
     advance = GymnasiumBatchEnv._advance
     monkeypatch.setattr(BeliefFilter, "step", diverge)
     monkeypatch.setattr(GymnasiumBatchEnv, "_advance", look)
-    found = evaluate_condition(trained, point, ["sampled"], protocol).to_dict("records")
+    found = evaluate_condition(agent, point, ["sampled"], protocol).to_dict("records")
     assert [row["diverged"] for row in found] == [0, 1, 0]
     assert np.isnan(found[1]["log_likelihood"])
     assert np.isfinite([row["return"] for row in found]).all()
@@ -51,11 +45,11 @@ def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(trained, monkey
     assert len(stopped) > 0
     assert (stopped == 0).all()
     assert (np.stack(actions)[:2, 1] != 0).all()
-    assert trained.agent.belief.filter.validate  # elsewhere it raises
+    assert agent.agent.belief.filter.validate  # elsewhere it raises
 
 
 @pytest.mark.parametrize("command", ["evaluate", "diagnose"])
-def test_the_belief_of_an_episode_that_is_over_goes_no_further(trained, monkeypatch, command):
+def test_the_belief_of_an_episode_that_is_over_goes_no_further(agent, monkeypatch, command):
     """Fed its last observation for ever it may diverge, and stop an evaluation of others."""
     step, means, resets = BeliefFilter.step, [], []
 
@@ -65,14 +59,14 @@ def test_the_belief_of_an_episode_that_is_over_goes_no_further(trained, monkeypa
         return step(self, *args, **options)
 
     monkeypatch.setattr(BeliefFilter, "step", look)
-    point = parse("mcar:0.5", trained.settings)
+    point = parse("mcar:0.5", agent.settings)
     if command == "evaluate":
         rows = evaluate_condition(
-            trained, point, ["sampled"], Protocol(4, 1, 0, 1, None, 4.0)
+            agent, point, ["sampled"], Protocol(4, 1, 0, 1, None, 4.0)
         ).to_dict("records")
         lengths = [row["length"] for row in rows]
     else:
-        tally = diagnose(trained, point, episodes=4, mode="sampled", seed=1, bins=[1, 2])
+        tally = diagnose(agent, point, episodes=4, mode="sampled", seed=1, bins=[1, 2])
         lengths = tally.lengths.int().tolist()
     assert len(set(lengths)) > 1
     assert len(means) == max(lengths)

@@ -22,11 +22,6 @@ from recipe_tools import read_table, refused
 from training.run_folder import read_config, write_config
 
 
-@pytest.fixture(scope="module")
-def agent(drbpn):
-    return load_trained_agent(drbpn)
-
-
 def test_more_episodes_only_add(trained_run, tmp_path, monkeypatch):
     """Starts, gaps, noise, spikes, outages, actions and particles, across blocks of simulators."""
     monkeypatch.setattr(episodes_room, "BLOCK", 3)
@@ -185,10 +180,7 @@ def test_a_pattern_gives_the_runs_and_a_folder_named_twice_is_one(drbpn, feedfor
             find_folders(wanted)
 
 
-def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(drbpn, tmp_path, capsys):
-    young = tmp_path / "young"
-    young.mkdir()
-    shutil.copy(drbpn / "config.yaml", young)
+def test_a_run_that_has_no_checkpoint_yet_is_left_out_with_a_line(drbpn, young, tmp_path, capsys):
     rows = evaluate(tmp_path / "out.csv", drbpn, young, points="none:0")
     assert {row["run"] for row in rows} == {"drbpn"}
     assert "young: left out, it has no checkpoint yet" in capsys.readouterr().out

@@ -15,11 +15,6 @@ from torchrl_drbpn.functional import draw_mechanism
 
 
 @pytest.fixture(scope="module")
-def agent(drbpn):
-    return load_trained_agent(drbpn)
-
-
-@pytest.fixture(scope="module")
 def settings(agent):
     return agent.settings
 

@@ -158,10 +158,9 @@ def test_runs_are_drawn_together_with_a_row_a_seed_criterion_and_place(runs, tmp
         assert part.variance_left.is_monotonic_decreasing
 
 
-def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(runs, tmp_path, capsys):
-    young = tmp_path / "young"
-    young.mkdir()
-    shutil.copy(runs[0] / "config.yaml", young)
+def test_runs_without_a_model_or_a_checkpoint_are_left_out_with_a_line(
+    runs, young, tmp_path, capsys
+):
     assert draw([str(runs[3]), str(runs[0]), str(young)], tmp_path / "out") == 0
     said = capsys.readouterr().out
     assert "3-none: left out; `belief=none` has learned no H, P and R" in said

@@ -1,7 +1,5 @@
 """`collector=ray`: one run whose simulators and policies are in workers on two nodes."""
 
-import sys
-
 import pytest
 import torch
 from ppo_drbpn import train_rollout
@@ -10,12 +8,6 @@ from training.checkpoint import checkpoint_frames
 from training.errors import EnvironmentFault
 
 RAY = ("experiment=smoke", "collector=ray", "evaluation.every_frames=0")
-
-
-def test_without_ray_the_pip_command_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with refused(r"`collector=ray` needs Ray: pip install 'ray>=2.60'"):
-        assembled(*RAY)
 
 
 @pytest.mark.slow

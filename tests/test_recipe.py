@@ -87,12 +87,22 @@ def test_the_statistics_are_constant_while_a_rollout_is_collected_and_learned_fr
     assert (training.agent.norm.count > counts[-1]).all()
 
 
-@pytest.mark.parametrize("name", ["tensorboard", "wandb", "mlflow"])
-def test_a_logger_that_is_not_installed_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, name):
-    monkeypatch.setitem(sys.modules, name, None)
-    with refused(rf"`logger={name}` .*: pip install {name}\.$"):
-        run(tmp_path / "run", *SMOKE, f"logger={name}")
-    assert not list((tmp_path / "run").iterdir())
+@pytest.mark.parametrize(
+    ("package", "word", "line"),
+    [
+        *[(name, f"logger={name}", rf"`logger={name}` .*: pip install {name}\.$")
+          for name in ("tensorboard", "wandb", "mlflow")],
+        ("ray", "collector=ray", r"`collector=ray` needs Ray: pip install 'ray>=2.60'"),
+        ("envpool", "env.backend=envpool", r"pip install 'torchrl-drbpn\[envpool\]'"),
+    ],
+)  # fmt: skip
+def test_a_package_that_is_missing_is_one_line_and_leaves_nothing(
+    tmp_path, monkeypatch, package, word, line
+):
+    monkeypatch.setitem(sys.modules, package, None)
+    with refused(line):
+        run(tmp_path / "run", *SMOKE, word)
+    assert not list(tmp_path.glob("run/*"))
 
 
 def test_one_seed_gives_one_result_and_another_seed_another(smoke, tmp_path):

@@ -1,11 +1,10 @@
 """The training recipe over EnvPool, whose simulators keep their state to themselves."""
 
 import shutil
-import sys
 
 import pytest
 from ppo_drbpn import train_rollout
-from recipe_tools import assembled, differences, read_table, refused, resume, run
+from recipe_tools import assembled, differences, read_table, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint
 
 SMOKE = (
@@ -62,9 +61,3 @@ def test_all_but_the_episodes_is_restored_and_the_first_ones_are_not_repeated():
     assert carrier["is_init"].all()
     assert not carrier["step_count"].any()
     assert not (carrier["observation"] == start).all(-1).any()
-
-
-def test_without_envpool_the_answer_is_one_line(monkeypatch):
-    monkeypatch.setitem(sys.modules, "envpool", None)
-    with refused(r"pip install 'torchrl-drbpn\[envpool\]'"):
-        assembled(*SMOKE)
