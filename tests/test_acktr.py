@@ -1,13 +1,16 @@
-"""ACKTR behind the recipe's one path (`algo=acktr`)."""
+"""ACKTR behind the recipe's one path; its steps are held to Fisher matrices in float64."""
 
+import itertools
 import shutil
 
 import pytest
 import torch
 from algorithms.acktr import ACKTR
+from algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
 from ppo_drbpn import collect, train_rollout
 from recipe_tools import assembled, assert_same_run, read_table, resume, run
 from tensordict import TensorDictBase
+from torch import Tensor, nn
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.ppo import add_advantages
 from training.state import Training
@@ -102,3 +105,184 @@ def test_the_generator_of_the_whole_process_is_left_alone():
     before = torch.get_rng_state()
     training.algorithm.update(data, 1.0)
     assert torch.equal(before, torch.get_rng_state())
+
+
+N = 40
+NUMBERS = {"lr": 1.0, "momentum": 0.0, "damping": 1e-12, "decay": 0.9, "max_kl": 1e9}
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+def normal(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def white_noise(generator: torch.Generator, samples: int, components: int) -> Tensor:
+    """Noise whose second moments over the samples are the identity to the last digits."""
+    q, _ = torch.linalg.qr(normal(generator, samples, components))
+    return q * samples**0.5
+
+
+def network(generator: torch.Generator, *sizes: int) -> nn.Sequential:
+    """A tanh network in float64; the last layer is linear."""
+    layers: list[nn.Module] = []
+    for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+        layers += [nn.Linear(inputs, outputs, dtype=torch.float64), nn.Tanh()]
+        for p in layers[2 * i].parameters():
+            p.data = 0.5 * normal(generator, *p.shape)
+    return nn.Sequential(*layers[:-1])
+
+
+def flat(weight: Tensor, bias: Tensor) -> Tensor:
+    """Weight and bias as one vector, column after column: kron(A, G) acts on it."""
+    return torch.cat([weight, bias[:, None]], 1).T.reshape(-1)
+
+
+def observe(optimizer: KFAC, module: nn.Module, inputs: Tensor, score: Tensor) -> Tensor:
+    with optimizer.recording():
+        output = module(inputs)
+    optimizer.observe(output, score)
+    return output
+
+
+def test_the_factors_of_a_linear_gaussian_layer_are_its_exact_fisher_matrix(generator):
+    layer = network(generator, 3, 2)[0]
+    inputs, std = normal(generator, N, 3), torch.tensor([0.5, 2.0], dtype=torch.float64)
+    a, g = kronecker_factors(inputs, white_noise(generator, N, 2) / std)
+    # E[J' R^-1 J], J the derivative of the mean by the parameters, one sample at a time
+    exact = torch.zeros(8, 8, dtype=torch.float64)
+    for x in inputs:
+        rows = []
+        for k in range(2):
+            weight, bias = torch.autograd.grad(layer(x)[k], list(layer.parameters()))
+            rows.append(flat(weight, bias))
+        jacobian = torch.stack(rows)
+        exact += jacobian.T @ torch.diag(std**-2) @ jacobian / N
+    torch.testing.assert_close(torch.kron(a, g), exact, rtol=1e-12, atol=1e-12)
+
+
+def test_the_curvature_of_every_layer_is_a_weighted_mean_of_what_was_observed(generator):
+    module, decay = network(generator, 3, 4, 2), 0.7
+    optimizer = KFAC(module, **{**NUMBERS, "decay": decay})
+    seen = []
+    for _ in range(3):
+        inputs, score = normal(generator, N, 3), normal(generator, N, 2)
+        observe(optimizer, module, inputs, score)
+        # The score of a layer's output is the gradient by its bias, one sample at a time.
+        biases = [module[0].bias, module[2].bias]
+        grads = [
+            torch.autograd.grad(module(x) @ s, biases) for x, s in zip(inputs, score, strict=True)
+        ]
+        hidden = torch.tanh(module[0](inputs)).detach()
+        pairs = zip((inputs, hidden), zip(*grads, strict=True), strict=True)
+        seen.append([kronecker_factors(a, torch.stack(g)) for a, g in pairs])
+    weights = torch.tensor([decay**2, decay, 1.0], dtype=torch.float64)
+    weights = weights / weights.sum()
+    for layer, place in enumerate((0, 2)):
+        state = optimizer.state[module[place].weight]
+        for factor, key in enumerate("ag"):
+            mean = sum(w * each[layer][factor] for w, each in zip(weights, seen, strict=True))
+            torch.testing.assert_close(state[key] / (1 - decay**3), mean)
+
+
+@pytest.mark.parametrize("samples", [N, 2], ids=["full rank", "deficient"])
+def test_the_natural_gradient_solves_with_the_damped_kronecker_matrix(generator, samples):
+    a, g = kronecker_factors(normal(generator, samples, 4), normal(generator, samples, 3))
+    gradient, damping = normal(generator, 3, 5), 0.03
+    solution = solve_kronecker(gradient, a, g, damping)
+    matrix = torch.kron(a, g) + damping * torch.eye(15, dtype=torch.float64)
+    expected = torch.linalg.solve(matrix, gradient.T.reshape(-1)).reshape(5, 3).T
+    torch.testing.assert_close(solution, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_one_step_solves_linear_regression(generator):
+    """With unit step size and no damping a natural-gradient step is Newton's."""
+    layer = network(generator, 3, 2)[0]
+    inputs, target = normal(generator, N, 3), normal(generator, N, 2)
+    optimizer = KFAC(layer, **NUMBERS)
+    output = observe(optimizer, layer, inputs, white_noise(generator, N, 2))
+    ((output - target).square().sum(-1).mean() / 2).backward()
+    optimizer.step()
+    design = torch.cat([inputs, torch.ones(N, 1, dtype=torch.float64)], 1)
+    best = torch.linalg.lstsq(design, target).solution.T
+    torch.testing.assert_close(layer.weight, best[:, :-1], rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(layer.bias, best[:, -1], rtol=1e-8, atol=1e-8)
+
+
+def test_the_step_of_a_parameter_of_constant_fisher_information_divides_by_it():
+    log_std = nn.Parameter(torch.tensor([0.3, -1.0], dtype=torch.float64))
+    module = nn.Module()
+    module.log_std = log_std
+    optimizer = KFAC(module, **{**NUMBERS, "damping": 0.5}, constant_fisher={log_std: 2.0})
+    before = log_std.detach().clone()
+    log_std.grad = torch.tensor([1.0, -3.0], dtype=torch.float64)
+    optimizer.step()
+    torch.testing.assert_close(before - log_std.detach(), log_std.grad / 2.5)
+
+
+@pytest.mark.parametrize("max_kl", [1e-4, 0.3])
+def test_a_long_step_is_shortened_to_the_divergence_asked_for(generator, max_kl):
+    """The divergence of a linear Gaussian model is quadratic: here the prediction is the truth."""
+    layer, std = network(generator, 3, 2)[0], torch.tensor([0.5, 2.0], dtype=torch.float64)
+    inputs = normal(generator, N, 3)
+    optimizer = KFAC(layer, **{**NUMBERS, "lr": 100.0, "max_kl": max_kl})
+    old = observe(optimizer, layer, inputs, white_noise(generator, N, 2) / std)
+    (old - normal(generator, N, 2)).square().mean().backward()
+    predicted = optimizer.step()
+    true = ((layer(inputs) - old) / std).square().sum(-1).mean() / 2
+    torch.testing.assert_close(predicted, torch.tensor(max_kl, dtype=torch.float64))
+    torch.testing.assert_close(true, predicted, rtol=1e-6, atol=0.0)
+
+
+def test_the_steps_are_averaged_by_momentum():
+    parameter = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    module = nn.Module()
+    module.parameter = parameter
+    numbers = {**NUMBERS, "lr": 0.5, "momentum": 0.9}
+    optimizer = KFAC(module, **numbers, constant_fisher={parameter: 1.0})
+    parameter.grad = torch.ones(1, dtype=torch.float64)
+    positions = [0.0]
+    for _ in range(200):
+        optimizer.step()
+        positions.append(parameter.item())
+    assert positions[1] == pytest.approx(-0.5 * 0.1)
+    assert positions[2] - positions[1] == pytest.approx(-0.5 * 0.1 * 1.9)
+    assert positions[-1] - positions[-2] == pytest.approx(-0.5)
+
+
+def test_a_step_before_any_curvature_is_refused(generator):
+    layer = network(generator, 3, 2)[0]
+    layer(normal(generator, N, 3)).sum().backward()
+    with pytest.raises(RuntimeError, match="`step` needs a curvature: call `observe` first"):
+        KFAC(layer, **NUMBERS).step()
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        (nn.Sequential(nn.Linear(2, 2), nn.LayerNorm(2)), "got 1.weight, 1.bias"),
+        (nn.Linear(2, 2, bias=False), "got a layer without bias"),
+    ],
+    ids=["layer-norm", "no-bias"],
+)
+def test_other_layers_are_refused_by_name(module, line):
+    with pytest.raises(ValueError, match=f"`module` must hold linear layers.*{line}"):
+        KFAC(module, **NUMBERS)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "line"),
+    [
+        ("lr", 0.0, "`lr` must be positive, got 0.0"),
+        ("damping", 0.0, "`damping` must be positive"),
+        ("max_kl", -1.0, "`max_kl` must be positive"),
+        ("momentum", 1.0, r"`momentum` must lie in \[0, 1\), got 1.0"),
+        ("decay", -0.1, r"`decay` must lie in \[0, 1\)"),
+    ],
+)
+def test_numbers_without_sense_are_refused(name, value, line):
+    with pytest.raises(ValueError, match=line):
+        KFAC(nn.Linear(2, 2), **{**NUMBERS, name: value})
