@@ -15,9 +15,13 @@ from gymnasium.spaces import flatten, flatten_space
 from gymnasium.wrappers import OrderEnforcing, TransformObservation
 from numpy.typing import NDArray
 
-from torchrl_drbpn.envs.engine_warnings import bad_state_counters, model_warnings_once
+from torchrl_drbpn.envs.mujoco_engine import (
+    bad_state_counters,
+    load_state,
+    model_warnings_once,
+    save_state,
+)
 from torchrl_drbpn.envs.simulator_batch import NO_SEED, SimulatorBatch, StepArrays, one_line
-from torchrl_drbpn.envs.simulator_state import load_state, save_state
 
 
 class GymnasiumBatchEnv(SimulatorBatch):
@@ -169,7 +173,7 @@ class GymnasiumBatchEnv(SimulatorBatch):
 
     @property
     def supports_state(self) -> bool:
-        """Whether the whole state can be saved: True for plain MuJoCo environments."""
+        """Whether the whole state can be saved: True for MuJoCo environments without wrappers."""
         return all(isinstance(env, MujocoEnv) for env in self.envs)
 
     def _rows_state(self) -> dict[str, NDArray[Any]]:
@@ -184,7 +188,7 @@ class GymnasiumBatchEnv(SimulatorBatch):
         return {"simulators": save_state(self.envs), **rows}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that :meth:`get_extra_state` returned; see the base class."""
+        """Go on from a state that :meth:`get_extra_state` returned, or refuse it."""
         if not self.supports_state:
             super().set_extra_state(state)
             return

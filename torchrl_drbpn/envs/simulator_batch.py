@@ -1,7 +1,6 @@
 """What every batch of simulators shares: specs, clipping, time limit, resets, seeds, errors.
 
-A wrapper around one environment pays TorchRL's per-step Python once for every simulator step; a
-batch pays it once for all of them: what the simulators return crosses into torch once a step.
+A batch pays TorchRL's per-step Python once for all of its simulators.
 """
 
 from __future__ import annotations
@@ -245,12 +244,7 @@ class SimulatorBatch(EnvBase):
         return {}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that :meth:`get_extra_state` returned; ``load_state_dict`` calls it.
-
-        Raises:
-            ValueError: if the state is of another task or number of environments, or incomplete.
-            RuntimeError: for a state where :attr:`supports_state` is False.
-        """
+        """Go on from a state that :meth:`get_extra_state` returned, or refuse it."""
         if state:
             raise RuntimeError(
                 f"the state of `{self.env_id}` can not be restored by `{type(self).__name__}`: "

@@ -118,15 +118,12 @@ class BeliefModelLoss(LossModule):
         return TensorDict({"loss_model": value, "log_likelihood": per_entry.detach()})
 
     def last_steps(self, tensordict: TensorDictBase) -> Tensor:
-        """Return which steps have a next observation that is no other step's own.
+        """Return which steps, bool ``(*batch, time)``, have a next observation of their own alone.
 
         Those that terminated, that are ``final`` (the rollout was cut there), or that are ``done``.
         In data of a replay buffer of single steps ``done`` alone does not count: TorchRL's
         SliceSampler writes it where it cuts a slice. Mark the ends of episodes and rollouts as
         ``final`` before such data are stored.
-
-        Args:
-            tensordict: rollout data, of whose batch size ``(*batch, time)`` the result is, bool.
         """
         keys, shape = self.tensor_keys, tensordict.shape
         none = torch.zeros(shape, dtype=torch.bool, device=tensordict.get(keys.observed).device)

@@ -14,11 +14,7 @@ from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.common import LossModule
-from torchrl.objectives.utils import (
-    ValueEstimators,
-    default_value_kwargs,
-    dispatch_value_estimator,
-)
+from torchrl.objectives.utils import ValueEstimators
 
 from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, in_next
 
@@ -91,6 +87,7 @@ class DRBPNLoss(LossModule):
 
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.GAE
+    SUPPORTED_VALUE_ESTIMATORS = ClipPPOLoss.SUPPORTED_VALUE_ESTIMATORS
     filter_network: TensorDictModuleBase
     filter_network_params: TensorDictParams | None
     target_filter_network_params: TensorDictParams
@@ -233,16 +230,10 @@ class DRBPNLoss(LossModule):
         self, value_type: ValueEstimators | None = None, **hyperparams: Any
     ) -> DRBPNLoss:
         """Build TorchRL's estimator of advantages, GAE by default, over ``critic_network``."""
-        value_type = value_type or self.default_value_estimator
-        if not isinstance(value_type, ValueEstimators):
-            super().make_value_estimator(value_type, **hyperparams)
-            return self
-        names = ("advantage", "value_target", "value", "reward", "done", "terminated")
-        keys = {name: getattr(self.tensor_keys, name) for name in (*names, "sample_log_prob")}
-        dispatch_value_estimator(
-            self, value_type, supported=ClipPPOLoss.SUPPORTED_VALUE_ESTIMATORS, tensor_keys=keys,
-            **{**default_value_kwargs(value_type), "deactivate_vmap": True, **hyperparams},
-        )  # fmt: skip
+        if isinstance(value_type or self.default_value_estimator, ValueEstimators):
+            hyperparams = {"deactivate_vmap": True, **hyperparams}
+        # PPO's own method, which reads the networks and the keys of the loss that it is given
+        ClipPPOLoss.make_value_estimator(self, value_type, **hyperparams)
         return self
 
     def reset_parameters_recursive(self) -> None:
@@ -279,15 +270,12 @@ class DRBPNLoss(LossModule):
         return out
 
     def _add_last_observations(self, data: TensorDictBase, model_loss: BeliefModelLoss) -> None:
-        """Write the likelihood of the next observation where no other step holds it.
-
-        Only those few steps are gathered, as a pass over all of them would cost as much as the
-        filter itself; their number depends on the data, so that a compiled loss takes all.
-        """
+        """Write the likelihood of the next observation where no other step holds it."""
         keys, following = model_loss.tensor_keys, data.get("next", None)
         if following is None or following.get(keys.observed, None) is None:
             return  # without a next step nothing is added
         last = model_loss.last_steps(data).flatten()
+        # a pass over all would cost as much as the filter; compiled, the number must not vary
         if torch.compiler.is_compiling():
             index = torch.arange(len(last), device=last.device)
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import takewhile
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, TypedDict
 
@@ -91,12 +91,13 @@ def check_count(numbers: Tensor | None, name: str, count: int, per: str) -> None
 # --------------------------------------------------------------- checks, of specs and of data alike
 def read_leaf(source: Any, key: NestedKey, owner: Transform) -> Any:
     """Return the tensor or spec under `key`, or raise a KeyError that names the transform."""
-    if key not in source.keys(True, True):
+    leaf = source.get(key, None)
+    if leaf is None:
         raise KeyError(
             f"`{type(owner).__name__}` reads {key!r}, which is not among "
             f"{sorted(map(str, source.keys(True, True)))}. Pass the key that the environment has."
         )
-    return source[key]
+    return leaf
 
 
 def read_vector(source: Any, key: NestedKey, owner: Transform) -> Any:
@@ -138,20 +139,19 @@ def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transfor
 def environment_of(transform: Transform) -> EnvBase | None:
     """Return the environment that holds the transform, if any does."""
     try:
-        env: EnvBase | None = transform.container
+        return transform.container
     except ValueError:  # inside a Compose that belongs to no environment
         return None
-    return env
 
 
-def chain_of(transform: Transform) -> Iterator[Transform]:
-    """Yield the transforms of its environment in their order; those in workers can't be seen."""
-    env, layers = environment_of(transform), []
+def chain_of(transform: Transform) -> list[Transform]:
+    """Return the transforms of its environment in their order; those in workers can't be seen."""
+    env = environment_of(transform)
+    chain: list[Transform] = []
     while isinstance(env, TransformedEnv):
-        layers.append([part for part in env.transform.modules() if isinstance(part, Transform)])
+        chain = [part for part in env.transform.modules() if isinstance(part, Transform)] + chain
         env = env.base_env
-    for layer in reversed(layers):
-        yield from layer
+    return chain
 
 
 def flagged_rows(tensordict: TensorDictBase, key: NestedKey, value: Tensor) -> Tensor | None:

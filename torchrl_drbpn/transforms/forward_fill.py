@@ -24,7 +24,8 @@ class FillLastObserved(EnvironmentTransform):
     r"""Replace missing entries by the last observed value of the same episode.
 
     filled_t = x_t where observed, filled_{t-1} elsewhere, `fill_value` before the first observed
-    value of an episode. The mask stays as it is. The last values travel in the tensordict.
+    value of an episode. The mask stays as it is. The last values travel in the tensordict. A
+    transform after it that makes entries go missing is refused with a ValueError.
 
     Args:
         in_keys: observations, shape `(*batch, obs)`, floating point.
@@ -35,9 +36,6 @@ class FillLastObserved(EnvironmentTransform):
         fill_value: what stands in for an entry never observed in this episode, in the units of the
             observation here; NaN marks it for `MaskedObservationNorm(missing="keep")`.
         state_keys: where the last values are kept. Default `last_<name>` beside each observation.
-
-    Raises:
-        ValueError: if numbers of keys do not match, or missingness stands after the transform.
 
     Examples:
         >>> from tensordict import TensorDict

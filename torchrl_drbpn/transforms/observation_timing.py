@@ -21,14 +21,12 @@ class ObservationDelay(CarriedStateTransform):
     r"""Let every reading arrive some steps after it was taken.
 
     A reading of step t arrives at step $t + d$, d = `delay`, or drawn for every reading uniformly
-    from `delay` to `max_delay`. A step at which nothing new arrives is masked; of several that
-    arrive at once the newest counts. With random delays a reading may arrive after one that was
-    taken later: it is shown, as a network that does not sort would do, or dropped with
-    `in_order=True`. What arrives counts as observed and is d steps old: nothing tells its age.
-
-    With a delay of d the first d steps of an episode show nothing. A reading that a mask hides was
-    never sent: the mask so far is delayed with its readings. A simulator that resets itself inside
-    its step lets the last readings of an episode arrive in the next one.
+    from `delay` to `max_delay`. A step at which nothing new arrives, as the first d of an episode,
+    is masked; of several that arrive at once the newest counts. With random delays a reading may
+    arrive after one that was taken later: it is shown, as a network that does not sort would do, or
+    dropped with `in_order=True`. A reading that a mask hides was never sent: the mask so far is
+    delayed with its readings. A simulator that resets itself inside its step lets the last readings
+    of an episode arrive in the next one.
 
     Args:
         delay: steps, 0 or more; a number for all, or one for each group (each component, where

@@ -13,8 +13,6 @@ from torchrl_drbpn.transforms._base import Role, Step
 from torchrl_drbpn.transforms._carried import CarriedStateTransform, Groups
 from torchrl_drbpn.transforms.seeding import SeededKeys
 
-_INITIAL = ("stationary", "on")
-
 
 class SensorOutages(CarriedStateTransform):
     r"""Let sensors fail and come back, each a two-state Markov chain over the steps of an episode.
@@ -26,8 +24,7 @@ class SensorOutages(CarriedStateTransform):
 
     the Gilbert-Elliott model of packets that are dropped in bursts, in Gilbert's form: all are lost
     in the bad state, none in the good one (Bell System Technical Journal 1960 and 1963).
-    $L = 1/(1 - \eta)$ is MCAR at $\eta$; a shorter L makes sensors alternate, L = 1 at $\eta = .5$
-    strictly.
+    $L = 1/(1 - \eta)$ is MCAR at $\eta$; a shorter L makes sensors alternate.
 
     With `initial="stationary"` every entry of every step, the first included, is missing with
     probability exactly $\eta$. With `initial="on"` every sensor works at a reset and t steps later
@@ -48,7 +45,7 @@ class SensorOutages(CarriedStateTransform):
             each index in one list at most; entries in none always arrive. None, the default: every
             entry by itself.
         state_key: bool `(*batch, groups)`, True for a group that works; by default `sensor_on`
-            beside the first observation. Two `SensorOutages` in one environment need two.
+            beside the first observation.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Example:
@@ -58,8 +55,6 @@ class SensorOutages(CarriedStateTransform):
         >>> observed = data["observed"]
         >>> bool((observed[:, 0] == observed[:, 1]).all()), bool(observed[:, 3].all())
         (True, True)
-
-    See also: `torchrl_drbpn.functional.outage_rates`.
     """
 
     role: ClassVar[Role] = "missingness"
@@ -80,8 +75,8 @@ class SensorOutages(CarriedStateTransform):
         super().__init__(groups=groups, state_keys=state_key, **keys)
         self.rates = outage_rates(eta, mean_length)
         self.eta, self.mean_length = float(eta), float(mean_length)
-        if initial not in _INITIAL:
-            raise ValueError(f"`initial` must be one of {_INITIAL}, got {initial!r}.")
+        if initial not in ("stationary", "on"):
+            raise ValueError(f"`initial` must be one of 'stationary' and 'on', got {initial!r}.")
         self.initial = initial
 
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:

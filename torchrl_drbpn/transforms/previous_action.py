@@ -38,9 +38,6 @@ class PreviousAction(EnvironmentTransform):
         one_hot: write an index action (`Categorical`, n actions) as a one-hot vector of floats,
             shape `(*batch, n)`.
 
-    Raises:
-        ValueError: as many out_keys as in_keys are needed, and `one_hot` needs index actions.
-
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> env = GymEnv("CartPole-v1", categorical_action_encoding=True)

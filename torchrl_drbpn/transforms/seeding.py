@@ -50,11 +50,9 @@ if hasattr(os, "register_at_fork"):
 
 
 def _separate_worker() -> None:
-    """Advance a global generator copied from the parent by the name of the process, once.
-
-    `torch.manual_seed` in the process, as by `ParallelEnv.set_seed`, before or after, overrides it.
-    """
+    """Advance a global generator copied from the parent by the name of the process, once."""
     global _inherited
+    # `torch.manual_seed` in the process, as by `ParallelEnv.set_seed`, overrides it at any time
     if _inherited is not None and torch.initial_seed() == _inherited:
         name = zlib.crc32(multiprocessing.current_process().name.encode())
         moved = torch.Generator().manual_seed(int(torch.randint(1 << 62, ())) ^ name)

@@ -86,9 +86,8 @@ class StuckSensors(FaultyReadings):
     working at the reset, t steps later stuck with probability $\eta (1 - (1 - p - 1/L)^t)$, $\eta =
     p / (p + 1/L)$. With `onset` all sensors of `groups` get stuck at this step of every episode.
 
-    A stuck reading arrives: its mask stays True, and a model that trusts every reading is misled.
-    A sensor is stuck at what it showed the step before, noise and other errors of transforms before
-    this one included; at 0 where nothing of it has arrived yet.
+    A stuck reading arrives: its mask stays True. It is what the sensor showed a step before, noise
+    and other errors of transforms before this one included; 0 where nothing has arrived yet.
 
     Args:
         probability: that a working sensor gets stuck at a step, in [0, 1]; this or `onset`.
@@ -139,8 +138,7 @@ class SensorDrift(FaultyReadings):
     drifts from the reset on, which counts as the first step; with `onset` from that step on; with
     `probability` drifts begin and end at random as the faults of `StuckSensors` do.
 
-    A drifting reading arrives: its mask stays True. Entries that a mask hides stay 0 while the bias
-    goes on growing.
+    A drifting reading arrives: its mask stays True. Under a mask the bias goes on growing.
 
     Args:
         walk_std: standard deviation of a step of the walk, observation units, finite and not

@@ -1,23 +1,26 @@
-"""The whole state of Gymnasium's MuJoCo environments as tensors, for runs that go on bit for bit.
+"""What is asked of MuJoCo itself: its warnings, states that it gave up, and its whole state.
 
-Three things make up what the next step depends on: the integration state of MuJoCo (positions,
-velocities, warm start of the solver, controls), the quantities that MuJoCo derives from it, and
-the random generator and the plain numbers that the Gymnasium object holds. The second is needed
-because the tasks read it between steps and it lags: after ``mj_step`` the body positions are those
-from before the last integration, and Ant and Humanoid take their velocities from them.
+The next step depends on the integration state of MuJoCo, on the quantities derived from it, and on
+the random generator and the plain numbers that the Gymnasium object holds. Derived quantities lag:
+after ``mj_step`` the body positions are those from before the last integration, and Ant and
+Humanoid take their velocities from them.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, MutableSequence, Sequence
+from contextlib import contextmanager
 from typing import Any
 
+import gymnasium
 import mujoco
 import numpy as np
 import torch
 from gymnasium.utils import seeding
 
+_log = logging.getLogger(__name__)
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 # Derived quantities of fixed size. Contacts and constraints are left out: a step makes them anew.
 # fmt: off
@@ -29,6 +32,38 @@ _DERIVED = (
     "qacc_smooth", "actuator_length", "actuator_velocity", "actuator_force", "sensordata",
 )
 # fmt: on
+
+
+def bad_state_counters(env: gymnasium.Env[Any, Any]) -> MutableSequence[int]:
+    """Return a view on MuJoCo's counters of states that it gave up; empty for other environments.
+
+    MuJoCo resets itself where positions, velocities or accelerations are huge or NaN, and drops
+    controls that are NaN.
+    """
+    data = getattr(env.unwrapped, "data", None)
+    if not isinstance(data, mujoco.MjData):
+        return []
+    # The four of interest are the last ones; a memoryview is read ten times faster than an array.
+    counters: Any = memoryview(data.warning.number[int(mujoco.mjtWarning.mjWARN_BADQPOS) :])
+    return counters
+
+
+@contextmanager
+def model_warnings_once() -> Iterator[None]:
+    """Log each warning about a model file once.
+
+    MuJoCo prints them, and appends them to a file in the current directory, once for every
+    simulator made: HalfCheetah's model has one in MuJoCo 4.0.
+    """
+    messages: dict[str, None] = {}
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: messages.update({text: None}))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
+        for text in messages:
+            _log.info("MuJoCo: %s", text)
 
 
 def save_state(envs: Sequence[Any]) -> dict[str, torch.Tensor]:
