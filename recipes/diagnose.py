@@ -6,8 +6,6 @@ precision.csv, calibration.csv and reliability.csv hold a row a class of entries
 them by the steps since a sensor was last seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from math import inf
 from pathlib import Path

@@ -6,8 +6,6 @@ every condition: the same command goes on where an evaluation was stopped. The f
 with its 95 % interval over the nominal and the realised missing ratio.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import inf
 from pathlib import Path

@@ -5,8 +5,6 @@ how a control loop calls it. The agent acts for some steps first: the file is ke
 same at each of them, with NaN in the place of what did not arrive and its own state fed back.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import logging

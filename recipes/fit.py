@@ -6,8 +6,6 @@ filter fitted by the same likelihood, the last value. Leaves table.csv, estimate
 filter.safetensors, from which ``belief.pretrained=`` of ppo_drbpn.py starts.
 """
 
-from __future__ import annotations
-
 import copy
 from math import inf
 from pathlib import Path

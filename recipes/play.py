@@ -6,8 +6,6 @@ gaps, and the belief with its 95 % interval. An agent without a belief is shown 
 alone.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from math import inf
 from pathlib import Path

@@ -6,8 +6,6 @@ they read in one step (observation_covariance.png). Runs of one task, method and
 are drawn together; runs that have not learned these are left out.
 """
 
-from __future__ import annotations
-
 from math import inf
 from typing import Any, Literal
 

@@ -5,8 +5,6 @@ versions in ``runs/<task>-<belief>-seed<seed>-<time>``; ``resume=<that folder>``
 Ctrl-C and SIGTERM save after the rollout in progress and leave with status 130 or 143.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import time

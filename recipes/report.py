@@ -5,8 +5,6 @@ tables, figures and README.md; ``from=results/robust`` makes the latter again, `
 of every study. notes.md in that folder, written by hand, is put below the heading.
 """
 
-from __future__ import annotations
-
 import glob
 from math import inf
 from pathlib import Path

@@ -5,8 +5,6 @@ of its normalisation among them), the final evaluation, and a card that says how
 what it returns. ``play.py``, ``evaluate.py`` and ``diagnose.py`` read it as they read a run.
 """
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ACKTR: natural-gradient steps for policy and value, each inside its trust region."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

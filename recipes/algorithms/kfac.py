@@ -8,8 +8,6 @@ Curvature, ICML 2015. [ACKTR] Y. Wu et al., Scalable trust-region method for dee
 learning using Kronecker-factored approximation, NeurIPS 2017.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any

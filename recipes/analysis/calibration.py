@@ -6,8 +6,6 @@ last seen: 1 where it was seen the step before, "never" where it was not seen ye
 All numbers are in normalised units, one being a running standard deviation of the sensor.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Figures of a diagnosis, drawn from its tables; None where there is nothing to draw."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tables of a diagnosis: one row a class of entries, with 95 % intervals over episodes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from typing import Any

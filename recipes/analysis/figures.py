@@ -1,7 +1,5 @@
 """Figures of a report and of an evaluation: learning curves, return under every condition."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import matplotlib as mpl

@@ -1,7 +1,5 @@
 """The page of a study: its tables in Markdown, and how to read them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,12 +1,10 @@
 """Run folders as three tables: one row a run, a point of its learning curve, an evaluation."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -60,7 +58,7 @@ class Study:
             write_table(folder / f"{field.name}.csv", getattr(self, field.name))
 
     @classmethod
-    def read(cls, folder: Path) -> Study:
+    def read(cls, folder: Path) -> Self:
         """Read the tables that :meth:`write` has written."""
         tables = [read_table(folder / f"{field.name}.csv", RUN) for field in fields(cls)]
         for table in tables:

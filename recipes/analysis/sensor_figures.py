@@ -1,7 +1,5 @@
 """Draw what trained beliefs have learned about their sensors: rankings and covariances."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 

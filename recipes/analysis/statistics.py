@@ -3,8 +3,6 @@
 A sample is the runs of one task, along its last axis: runs are resampled within their task.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The tables of a report: means over seeds, over tasks, and of one method against the others."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -14,8 +14,6 @@ normalised units.
 - `NOISE_VARIANCE`: of the sensor noise that the belief assumes, ``(*, obs)``
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

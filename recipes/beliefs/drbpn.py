@@ -1,7 +1,5 @@
 """The deep recurrent belief propagation network as the belief module of a recipe."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Deep variational reinforcement learning as the belief module of a recipe: a particle filter."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from beliefs import ESTIMATE, OBSERVATION, Belief

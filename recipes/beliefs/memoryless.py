@@ -1,7 +1,5 @@
 """No belief: the heads read the observation as it arrived, or with its gaps filled (FA-PPO)."""
 
-from __future__ import annotations
-
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn

@@ -1,7 +1,5 @@
 """The auxiliary task of the networks without a model: predict the next observation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

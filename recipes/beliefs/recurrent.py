@@ -1,7 +1,5 @@
 """Recurrent networks as belief modules: TorchRL's GRUModule or LSTMModule (DR-PPO, ADR-PPO)."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import torch

@@ -1,7 +1,5 @@
 """A transformer with a memory of its layers' inputs over the last steps of the episode."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

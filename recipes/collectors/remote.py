@@ -1,7 +1,5 @@
 """Rollouts of one run from several processes or machines, by Ray: ``collector=ray``."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 import math

@@ -3,11 +3,9 @@
 Readings are standardised here: one unit is one standard deviation of that sensor in the log.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -26,17 +24,17 @@ class Sequences(NamedTuple):
     observed: Tensor
     reset: Tensor
 
-    def rows(self, index: Tensor) -> Sequences:
+    def rows(self, index: Tensor) -> Self:
         """Return some of the rows."""
-        return Sequences(*(x[index] for x in self))
+        return self._make(x[index] for x in self)
 
-    def cut(self, length: int) -> Sequences:
+    def cut(self, length: int) -> Self:
         """Return windows of a length as rows; what is added at the end is a reset each step."""
         time = self.reset.shape[1]
         added = -time % length
         ends = [torch.cat([x, x.new_zeros(len(x), added, *x.shape[2:])], 1) for x in self]
         ends[-1][:, time:] = True
-        return Sequences(*(x.reshape(-1, length, *x.shape[2:]) for x in ends))
+        return self._make(x.reshape(-1, length, *x.shape[2:]) for x in ends)
 
 
 class Estimate(NamedTuple):

@@ -1,7 +1,5 @@
 """Read a log of a robot: a table with a row a step, whose missing cells are NaN or empty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

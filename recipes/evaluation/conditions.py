@@ -1,7 +1,5 @@
 """Conditions of an evaluation: what does not arrive or is wrong, written as text."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ Episodes run in batches of `BLOCK` simulators, however few are asked for: what a
 the seed alone, to the bit, so that more episodes only add to fewer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any

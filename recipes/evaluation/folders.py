@@ -1,7 +1,5 @@
 """Folders that a command line names."""
 
-from __future__ import annotations
-
 import glob
 import shlex
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Conditions and methods as text: what stands in tables and figures, and on the command line."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any

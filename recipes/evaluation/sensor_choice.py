@@ -7,8 +7,6 @@ step ago: quantities that change fast come first. H P H' and R are in the units 
 observation, one running standard deviation of each sensor in training.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """The table of an evaluation, which goes on where it was killed: it holds whole conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An agent that a run has trained, read from its folder: the only place that builds one anew."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ on, one that was killed before its first checkpoint starts anew; the same comman
 continues. A cell that fails ends no other. Hydra takes sweepers from packages of this name alone.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """Draw what a robot sensed, missed and believed during part of an episode."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

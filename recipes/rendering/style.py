@@ -1,7 +1,5 @@
 """The look of every figure, and how one is written."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

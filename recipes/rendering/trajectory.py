@@ -1,7 +1,5 @@
 """One episode of a trained agent, with everything that a picture of its belief needs."""
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import dataclass, replace

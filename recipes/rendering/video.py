@@ -4,8 +4,6 @@ TorchRL's PixelRenderTransform draws an observation before the agent has read it
 that step is not there yet: an episode is recorded first and drawn afterwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast

@@ -7,8 +7,6 @@ A run's folder holds all that it takes to build one, and to read one back::
     agent, frames = load_agent(folder, config, env)   # add_primers(env, agent) makes env step it
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checkpoints: everything a run needs to go on as if it had never stopped."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -3,8 +3,6 @@
 What a constructor refuses by itself is not checked here a second time: see :func:`build`.
 """
 
-from __future__ import annotations
-
 import datetime
 import difflib
 import os

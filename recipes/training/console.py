@@ -1,7 +1,5 @@
 """What a person sees and how he stops a run: lines, progress, Ctrl-C."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -31,7 +29,7 @@ def say(text: str) -> None:
 BAR = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
 
-def show(bar: tqdm[Any], row: Mapping[str, Any]) -> None:
+def show(bar: "tqdm[Any]", row: Mapping[str, Any]) -> None:
     """Show frames, return, realised missing ratio, log-likelihood and speed in a progress bar."""
     shown = {
         "return": "return {:.4g}",
@@ -51,7 +49,7 @@ class StopRequest:
     signal ends the process as usual. ``file`` is made when the signal comes, for other processes.
     """
 
-    current: ClassVar[StopRequest | None] = None
+    current: ClassVar["StopRequest | None"] = None
 
     def __init__(self, file: Path | None) -> None:
         self.file = file

@@ -1,7 +1,5 @@
 """The environment of a run: simulators, and what happens to their observations, in conf's order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What ends a run in one line."""
 
-from __future__ import annotations
-
 
 class UserError(Exception):
     """Report a bad setting, folder or checkpoint in one line; the recipe exits with status 2."""

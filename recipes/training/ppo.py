@@ -1,7 +1,5 @@
 """Clipped PPO and the likelihood of the belief's model: loss, advantages, minibatches, steps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal
 

@@ -1,8 +1,6 @@
 """Rewards over the running deviation of the discounted return, once a rollout."""
 
-from __future__ import annotations
-
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -27,7 +25,7 @@ class ReturnStatistics(NamedTuple):
     discounted: Tensor
 
     @classmethod
-    def start(cls, environments: int) -> ReturnStatistics:
+    def start(cls, environments: int) -> Self:
         """Return those of a run that begins."""
         zero = torch.zeros(1, dtype=torch.float64)
         return cls(zero, zero, zero, torch.zeros(environments, 1))

@@ -1,7 +1,5 @@
 """What a run leaves on disk: configuration, versions, tables, and a lock while it lasts."""
 
-from __future__ import annotations
-
 import fcntl
 import importlib.util
 import io

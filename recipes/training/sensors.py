@@ -1,7 +1,5 @@
 """What each component of an observation measures (conf/sensors.yaml), and what fails together."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import re

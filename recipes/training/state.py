@@ -1,7 +1,5 @@
 """Everything that changes while a run trains, saved and restored."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
