@@ -76,19 +76,17 @@ def ranking_rows(trained: TrainedAgent, model: SensorModel) -> list[dict[str, An
         order = model.ranking(criterion)
         columns = (x.tolist() for x in (order, *model.along(order)))
         for place, (sensor, information, left) in enumerate(zip(*columns, strict=True), 1):
-            rows.append(
-                trained.columns()
-                | {
-                    "criterion": criterion,
-                    "place": place,
-                    "component": sensor,
-                    "sensor": model.names[sensor],
-                    "information": information,
-                    "variance_left": left,
-                    "learned_noise_std": learned_std[sensor],
-                    "added_noise_std": model.added_std[sensor].item(),
-                }
-            )
+            row = {
+                "criterion": criterion,
+                "place": place,
+                "component": sensor,
+                "sensor": model.names[sensor],
+                "information": information,
+                "variance_left": left,
+                "learned_noise_std": learned_std[sensor],
+                "added_noise_std": model.added_std[sensor].item(),
+            }
+            rows.append(trained.columns() | row)
     return rows
 
 

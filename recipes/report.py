@@ -39,12 +39,8 @@ def run(config: dict[str, Any]) -> int:
     if not out or out.is_file():
         raise UserError(f"`out` must be the folder of a study, such as results/robust, got {out}.")
     check_limits(config, {"rows": (2, inf)}, whole=True)
-    study = read_runs(
-        find_folders(config["run"]),
-        config["table"],
-        rows=config["rows"],
-        unfinished=config["unfinished"],
-    )
+    how = {name: config[name] for name in ("rows", "unfinished")}
+    study = read_runs(find_folders(config["run"]), config["table"], **how)
     out.mkdir(parents=True, exist_ok=True)
     study.write(out)
     _write_page(out, config)

@@ -68,8 +68,7 @@ def precision_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[Row]:
 def calibration_rows(tally: Tally, *, resamples: int, seed: int) -> Iterator[Row]:
     """Yield the rows of calibration.csv: whether claimed deviations are right.
 
-    ``consistent_low`` and ``consistent_high`` are the band in which NIS over entries of a right
-    belief lies in 95 of 100 cases.
+    Between the ``consistent`` ends NIS over entries of a right belief lies in 95 of 100 cases.
     """
     resampling = Resampling(len(tally.lengths), resamples, seed)
     for pair, sums in tally.sums.items():

@@ -65,7 +65,6 @@ def learning_curves(training: pd.DataFrame) -> Figure | None:
 def robustness(summary: pd.DataFrame, *, rows: str, columns: str) -> Figure | None:
     """Draw return under every condition, a panel a pair of values of two columns of a summary.
 
-    ``rows`` and ``columns`` of panels differ in ``kind`` (of the conditions), ``mode`` or ``task``.
     The realised missing ratio is on the axis, nominal levels in grey; outages, noise and spikes are
     by their level. None where no kind has two levels.
     """

@@ -69,11 +69,8 @@ def page(
         score = _spread(tables["aggregate"].assign(text=lambda t: t.apply(_interval, axis=1)))
         parts += ["## Over all tasks", _AGGREGATE, score]
     if len(tables["comparison"]):
-        parts += [
-            "## Comparison",
-            _COMPARISON,
-            _comparison(tables["comparison"].query("mode == 'sampled'")),
-        ]
+        sampled = tables["comparison"].query("mode == 'sampled'")
+        parts += ["## Comparison", _COMPARISON, _comparison(sampled)]
     clean = runs[(runs.trained_on == "none:0") & (runs.noise_sigma == 0)]
     if len(clean):
         parts += ["## Sample efficiency", _EFFICIENCY, _efficiency(clean)]
@@ -168,20 +165,17 @@ def _percent(value: float) -> str:
 
 def _efficiency(runs: pd.DataFrame) -> str:
     rows = []
-    for (task, method, settings), members in runs.groupby(["task", "method", "settings"]):
+    names = ["task", "method", "settings"]
+    for key, members in runs.groupby(names):
         top = members.top_10_return.to_numpy(float)
         steps = [number(s) or "not reached" for s in members.steps_to_threshold]
-        rows.append(
-            {
-                "task": task,
-                "method": method,
-                "settings": settings,
-                "top-10 return": number(interquartile_mean(top)),
-                "of each seed": ", ".join(map(number, top)),
-                "threshold": number(family(members.task).map(THRESHOLDS).iloc[0]),
-                "steps to it": ", ".join(steps),
-            }
-        )
+        row = {
+            "top-10 return": number(interquartile_mean(top)),
+            "of each seed": ", ".join(map(number, top)),
+            "threshold": number(family(members.task).map(THRESHOLDS).iloc[0]),
+            "steps to it": ", ".join(steps),
+        }
+        rows.append(dict(zip(names, key, strict=True)) | row)
     return _markdown(pd.DataFrame(rows))
 
 

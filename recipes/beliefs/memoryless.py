@@ -7,24 +7,17 @@ from torch import Tensor, nn
 from beliefs import ESTIMATE, OBSERVATION, Belief
 
 
-def _features(observation: Tensor, observed: Tensor) -> Tensor:
-    """Hand on what arrived; a missing entry is 0, the running mean."""
-    del observed
-    return observation
-
-
-def _features_and_mask(observation: Tensor, observed: Tensor) -> Tensor:
-    return torch.cat([observation, observed.to(observation.dtype)], -1)
-
-
 def build(*, obs_dim: int, action_dim: int, with_mask: bool, filled: bool) -> Belief:
     """Build the absence of a belief; ``filled``: what arrives is what is held of each sensor."""
     del action_dim
-    module = TensorDictModule(
-        _features_and_mask if with_mask else _features,
-        in_keys=[OBSERVATION, "observed"],
-        out_keys=["features"],
-    )
+
+    def features(observation: Tensor, observed: Tensor) -> Tensor:
+        """Hand on what arrived; a missing entry is 0, the running mean."""
+        parts = [observation, observed.to(observation.dtype)]
+        return torch.cat(parts, -1) if with_mask else observation
+
+    in_keys = [OBSERVATION, "observed"]
+    module = TensorDictModule(features, in_keys=in_keys, out_keys=["features"])
     held = TensorDictModule(nn.Identity(), in_keys=[OBSERVATION], out_keys=[ESTIMATE])
     return Belief(
         module,

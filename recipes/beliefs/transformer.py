@@ -68,10 +68,9 @@ class MemoryAttention(nn.Module):
 
 
 def shifted(window: Tensor) -> Tensor:
-    """Move what each step holds of its window, ``(*, time, k)``, to where the window lies.
+    """Put the k values of each step t, ``(*, time, k)``, at entries t on of ``k - 1 + time``.
 
-    Row t of the result, ``(*, time, k - 1 + time)``, holds its k values from entry t on, -inf
-    elsewhere.
+    Elsewhere the result is -inf.
     """
     time, size = window.shape[-2:]
     count = size - 1 + time
@@ -96,9 +95,8 @@ class MemoryLayer(nn.Module):
     def forward(self, x: Tensor, memory: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
         """Return the steps' outputs, and the memory with their normalised inputs after it.
 
-        ``x`` is ``(rows, time, width)``; ``memory`` the normalised inputs of the layer at the k - 1
-        steps before, oldest first, ``(rows, k - 1, width)``; ``visible`` as in
-        :class:`MemoryAttention`.
+        ``memory``: the normalised inputs of the layer at the k - 1 steps before, oldest first,
+        ``(rows, k - 1, width)``; the others as in :class:`MemoryAttention`.
         """
         entries = torch.cat([memory, self.norm(x)], 1)
         x = x + self.attention(entries, visible)
@@ -207,10 +205,7 @@ class TransformerBelief(TensorDictModuleBase):
         return first[0], first[1], first[2]
 
     def _attend(self, x: Tensor, memory: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features (rows, time, width) and the memory after each step.
-
-        ``start`` is where the episode of each step began, ``(rows, time)``.
-        """
+        """Return features and memory after each step, of episodes that began at ``start``."""
         # The entries by the step they belong to; which are outside the window the layers know.
         entry = torch.arange(1 - self.window, x.shape[1], device=x.device)
         visible = entry >= start.unsqueeze(-1)

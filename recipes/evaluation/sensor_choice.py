@@ -1,10 +1,8 @@
 """Which sensors a trained belief would keep, by the model it has learned.
 
 P, the covariance before the readings, is the learned Q: the paper's filter takes the transition at
-the mean only, so that Q is what every step but an episode's first predicts, whatever arrived before
-(eq. 8). A sensor is thus valued by what it adds within one step, beside a state that was known one
-step ago: quantities that change fast come first. H P H' and R are in the units of the normalised
-observation, one running standard deviation of each sensor in training.
+the mean only (eq. 8). A sensor is thus valued by what it adds within one step: quantities that
+change fast come first. H P H' and R are in the units of the normalised observation.
 """
 
 import math

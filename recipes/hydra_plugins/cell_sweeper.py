@@ -9,8 +9,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -112,15 +111,21 @@ def run_sweep(sweep: Callable[[], Sequence[Sequence[JobReturn]]], folder: Path, 
         file.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"`hydra.sweep.dir` must be a folder to write to: {error}") from error
-    with stop_request(file) as stop, _environment(file, apart=apart):
-        try:
+    os.environ[STOP_FILE] = str(file)
+    if apart:  # the cells' processes must find the recipe; no bars among lines
+        path = os.pathsep.join(filter(None, [_RECIPES, os.environ.get("PYTHONPATH")]))
+        os.environ.update(PYTHONPATH=path, TQDM_DISABLE="1")
+    try:
+        with stop_request(file) as stop:
             batches = sweep()
-        except EXPECTED:
-            raise
-        except Exception as error:  # of a launcher: a process of it was ended from outside
-            raise UserError(
-                f"the sweep ended before its cells: {one_line(error)}. The same command goes on."
-            ) from error
+    except EXPECTED:
+        raise
+    except Exception as error:  # of a launcher: a process of it was ended from outside
+        raise UserError(
+            f"the sweep ended before its cells: {one_line(error)}. The same command goes on."
+        ) from error
+    finally:
+        file.unlink(missing_ok=True)
     results = [result.return_value for batch in batches for result in batch]
     lacking = {name: line for name, line in results if line}
     say(f"{len(results) - len(lacking)} of {len(results)} cells are done: {folder}")
@@ -132,24 +137,6 @@ def run_sweep(sweep: Callable[[], Sequence[Sequence[JobReturn]]], folder: Path, 
     if lacking:
         sys.exit(_FAILED)
     return batches
-
-
-@contextmanager
-def _environment(stop_file: Path, *, apart: bool) -> Iterator[None]:
-    """Tell the cells' processes where the recipe lies and what stops them; no bars among lines."""
-    changed = {STOP_FILE: str(stop_file)}
-    if apart:
-        path = os.pathsep.join(filter(None, [_RECIPES, os.environ.get("PYTHONPATH")]))
-        changed |= {"PYTHONPATH": path, "TQDM_DISABLE": "1"}
-    before = {name: os.environ[name] for name in changed.keys() & os.environ.keys()}
-    os.environ.update(changed)
-    try:
-        yield
-    finally:
-        for name in changed:
-            del os.environ[name]
-        os.environ.update(before)
-        stop_file.unlink(missing_ok=True)
 
 
 def _file_name(*parts: object) -> str:

@@ -70,20 +70,16 @@ class Recording:
 
 
 class Camera:
-    """Draw the state of a simulator by Gymnasium's ``rgb_array``, in a twin that is put into it.
-
-    ``size``: width and height in pixels; tasks without such arguments draw their own.
-    """
+    """Draw the state of a simulator by Gymnasium's ``rgb_array``, in a twin that is put into it."""
 
     def __init__(self, env_id: str, size: tuple[int, int]) -> None:
         if sys.platform.startswith("linux"):
             os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed
         options: dict[str, Any] = {"render_mode": "rgb_array", "disable_env_checker": True}
+        # Gymnasium's own choice is a camera that stays where the robot started.
+        tracking = {"width": size[0], "height": size[1], "camera_name": "track"}
         try:
-            # Gymnasium's own choice is a camera that stays where the robot started.
-            made = gymnasium.make(
-                env_id, width=size[0], height=size[1], camera_name="track", **options
-            )
+            made = gymnasium.make(env_id, **tracking, **options)
         except TypeError:
             made = gymnasium.make(env_id, **options)
         made.reset(seed=0)

@@ -100,22 +100,12 @@ class Agent(nn.Module):
 def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
     """Build an agent, with weights from torch's global generator."""
     obs_dim = env.observation_spec["observation"].shape[-1]
-    action_dim = env.action_spec.shape[-1]
-    norm = build(
-        "normalisation.observation",
-        config.normalisation.observation,
-        obs_dim=obs_dim,
-        complete_keys=(COMPLETE, _SCALED_COMPLETE),
-    )
-    belief: Belief = build("belief", config.belief, obs_dim=obs_dim, action_dim=action_dim)
-    actor, critic = build(
-        "heads",
-        config.heads,
-        feature_dim=belief.feature_dim,
-        obs_dim=obs_dim,
-        action_dim=action_dim,
-    )
-    return Agent(norm, belief, actor, critic)
+    sizes = {"obs_dim": obs_dim, "action_dim": env.action_spec.shape[-1]}
+    keys, node = (COMPLETE, _SCALED_COMPLETE), config.normalisation.observation
+    norm = build("normalisation.observation", node, obs_dim=obs_dim, complete_keys=keys)
+    belief: Belief = build("belief", config.belief, **sizes)
+    heads = build("heads", config.heads, feature_dim=belief.feature_dim, **sizes)
+    return Agent(norm, belief, *heads)
 
 
 def load_agent(folder: Path, config: DictConfig, env: TransformedEnv) -> tuple[Agent, int]:

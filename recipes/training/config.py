@@ -1,7 +1,4 @@
-"""The configuration of a run: composed by Hydra, checked once, built part by part.
-
-What a constructor refuses by itself is not checked here a second time: see :func:`build`.
-"""
+"""The configuration of a run: composed by Hydra, checked once, built part by part."""
 
 import datetime
 import difflib
@@ -83,10 +80,7 @@ def build(name: str, node: Any, *args: Any, **kwargs: Any) -> Any:
 
 
 def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
-    """Check types against those of the defaults, limits, and what must go together.
-
-    ``overrides`` are the words that the configuration was composed from.
-    """
+    """Check types against those of the defaults, limits, and what must go together."""
     groups = [word for word in overrides if (CONF / word.split("=")[0].lstrip("+~")).is_dir()]
     defaults = hydra.compose("config", groups)
     for key, value in leaves(config):

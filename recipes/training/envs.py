@@ -56,8 +56,6 @@ def make_env(
 ) -> TransformedEnv:
     """Build the batched, corrupted environment of a run, batch size ``(num_envs,)``.
 
-    The recurrent state's primer is not in it: :func:`training.agent.add_primers` appends it.
-
     What is None is the configuration's. ``transforms`` take the place of what stands at their names
     in ``config.transforms``; ``complete``: whether to write `COMPLETE`, what complete, noiseless
     sensors would have shown (None: where the critic reads it).
@@ -123,10 +121,7 @@ def make_torchrl_env(
     parallel: bool,
     observation_keys: Sequence[str],
 ) -> TransformedEnv:
-    """Build any environment of TorchRL, see conf/env/torchrl.yaml.
-
-    One that is a batch by itself, on a device perhaps, is taken as it is.
-    """
+    """Build any environment of TorchRL, see conf/env/torchrl.yaml."""
     del id, version  # its name in folders and tables
     try:
         base = make()

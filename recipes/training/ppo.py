@@ -19,38 +19,28 @@ _NAMES = {"kl_approx": "kl", "ESS": "ess"}
 def make_loss(
     agent: Agent,
     *,
-    clip_epsilon: float,
-    critic_coeff: float,
-    loss_critic_type: str,
     entropy_coeff: float,
-    normalize_advantage: bool,
     model_coeff: float,
     normalize: Literal["entry", "step"],
     detach_belief: bool,
+    **ppo: Any,
 ) -> LossModule:
     """Build the loss, see conf/loss/ppo.yaml; its outputs named ``loss*`` are to be summed."""
-    ppo = ClipPPOLoss(
+    clipped = ClipPPOLoss(
         agent.actor,
         agent.critic,
-        clip_epsilon=clip_epsilon,
         entropy_bonus=entropy_coeff > 0,
         entropy_coeff=entropy_coeff,
-        critic_coeff=critic_coeff,
-        loss_critic_type=loss_critic_type,
-        normalize_advantage=normalize_advantage,
         # The recipe reports it once a rollout; here it is a fifth of the PPO loss.
         log_explained_variance=False,
         # The parameters are those of the modules: swapping them in costs a tenth of an update.
         functional=False,
+        **ppo,
     )
     modelled = ("belief", "log_likelihood") in agent.belief.out_keys
-    return DRBPNLoss(
-        agent.belief,
-        ppo,
-        BeliefModelLoss(normalize=normalize) if modelled else None,
-        model_coeff=model_coeff,
-        detach_belief=detach_belief,
-    )
+    model = BeliefModelLoss(normalize=normalize) if modelled else None
+    weights: Any = {"model_coeff": model_coeff, "detach_belief": detach_belief}
+    return DRBPNLoss(agent.belief, clipped, model, **weights)
 
 
 @torch.no_grad()
@@ -120,15 +110,6 @@ class GradientSteps:
         self.epochs, self.minibatches, self.sequence_length = epochs, minibatches, sequence_length
         self.recompute_advantages = recompute_advantages
 
-    def take(self, loss: torch.Tensor) -> torch.Tensor:
-        """Take one step down a loss, which must be a finite number; return the gradient's norm."""
-        self.optimizer.zero_grad()
-        torch.autograd.backward(loss)
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-        check_finite({"grad_norm": norm}, "gradient")
-        self.optimizer.step()
-        return norm
-
 
 class PPO:
     """Take epochs of minibatch steps, in the order of ``seed``, on one loss."""
@@ -143,10 +124,9 @@ class PPO:
         self.generator = torch.Generator().manual_seed(seed)
 
     def update(self, data: TensorDictBase, remaining: float) -> dict[str, float]:
-        """Take the gradient steps of one rollout ``(environments, time)`` with advantages.
+        """Take the gradient steps of one rollout; return the means of what the loss reports.
 
-        The learning rate falls with ``remaining``, the share of the run still to come. Returns the
-        means of what the loss reports, and the learning rate.
+        The learning rate falls with ``remaining``, the share of the run still to come.
         """
         lr = self.steps.lr * remaining
         for group in self.steps.optimizer.param_groups:
@@ -176,7 +156,11 @@ class PPO:
         terms = dict(self.loss(minibatch).items())
         losses = {key: value for key, value in terms.items() if key.startswith("loss")}
         check_finite(losses, "loss")
-        norm = self.steps.take(torch.stack(list(losses.values())).sum())
+        self.steps.optimizer.zero_grad()
+        torch.autograd.backward(torch.stack(list(losses.values())).sum())
+        norm = torch.nn.utils.clip_grad_norm_(self.steps.parameters, self.steps.max_grad_norm)
+        check_finite({"grad_norm": norm}, "gradient")
+        self.steps.optimizer.step()
         return {**terms, "grad_norm": norm}
 
     def state_dict(self) -> dict[str, Any]:
@@ -203,11 +187,7 @@ def check_finite(tensors: Mapping[str, torch.Tensor], kind: str) -> None:
 
 
 def rollout_metrics(data: TensorDictBase) -> dict[str, float | None]:
-    """Return what a rollout with advantages says of the sensors, the belief and the value.
-
-    ``log_likelihood``: nats per observed entry, normalised, None without a model;
-    ``explained_variance``: of the returns by the values, 0 where they do not vary.
-    """
+    """Return what a rollout with advantages says of the sensors, the belief and the value."""
     observed, target = data.get("observed"), data.get("value_target")
     likelihood = data.get(("belief", "log_likelihood"), None)
     spread = target.var()
