@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from beliefs import ESTIMATE, ESTIMATE_VARIANCE, FORECAST, FORECAST_COV, NOISE_VARIANCE
 from evaluation.conditions import Condition
-from evaluation.episodes import BLOCK, run_episodes
+from evaluation.episodes import run_episodes
 from evaluation.trained import TrainedAgent
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -27,7 +27,6 @@ COVERAGE = (0.5, 0.9, 0.95)
 LEVELS = tuple(round(0.05 * i, 2) for i in range(1, 20))  # of the reliability curve
 FILTERED, PREDICTED, LAST_VALUE, MEAN = "filtered", "predicted", "last value", "running mean"
 ARRIVED, MISSING, READING, TRUTH, ALL = "arrived", "missing", "reading", "truth", "all"
-_CHUNK_NUMBERS = 2**24  # at most so many numbers of covariances are held at a time
 _SMALLEST_VARIANCE = 1e-12
 _WRITTEN = {
     FILTERED: ESTIMATE,
@@ -162,39 +161,28 @@ def diagnose(
     """
     obs = trained.obs_dim
     tally = Tally(class_names(bins), torch.zeros(episodes), torch.zeros(episodes), obs)
-    edges, chunk = torch.tensor(bins), max(1, min(64, _CHUNK_NUMBERS // (BLOCK * obs**2)))
+    edges = torch.tensor(bins)
     seen = torch.zeros(episodes, obs, dtype=torch.bool)
     since = torch.zeros(episodes, obs, dtype=torch.int64)
     last = torch.zeros(episodes, obs, dtype=torch.float64)
-    held: list[dict[str, Tensor]] = []
-    held_rows = slice(0)
-
-    def add_held() -> None:
-        if held:
-            tally.add(held_rows, {k: torch.stack([h[k] for h in held], 1) for k in held[0]})
-            held.clear()
 
     def watch(rows: slice, data: TensorDictBase, running: Tensor) -> None:
-        nonlocal held_rows
-        if rows != held_rows or len(held) == chunk:
-            add_held()
-        held_rows, observed = rows, data.get("observed")
+        observed = data.get("observed")
         reading = zero_missing(data.get("normalized_observation"), observed).double()
         last[rows] = torch.where(observed, reading, last[rows])
         gap = torch.bucketize(since[rows] + 1, edges, right=True) - 1
         written = {name: data.get(key, None) for name, key in _WRITTEN.items()}
-        held.append(
-            {
-                "running": running.unsqueeze(-1).expand_as(observed),
-                "observed": observed.clone(),
-                "class": torch.where(seen[rows], gap, len(bins)),
-                READING: reading,
-                TRUTH: data.get("normalized_complete_observation").double(),
-                LAST_VALUE: last[rows].clone(),
-                MEAN: torch.zeros_like(reading),
-            }
-            | {name: value.double() for name, value in written.items() if value is not None}
-        )
+        steps = {
+            "running": running.unsqueeze(-1).expand_as(observed),
+            "observed": observed,
+            "class": torch.where(seen[rows], gap, len(bins)),
+            READING: reading,
+            TRUTH: data.get("normalized_complete_observation").double(),
+            LAST_VALUE: last[rows],
+            MEAN: torch.zeros_like(reading),
+        }
+        steps |= {name: value.double() for name, value in written.items() if value is not None}
+        tally.add(rows, {name: value.unsqueeze(1) for name, value in steps.items()})
         tally.lengths[rows] += running
         tally.observed[rows] += observed.sum(-1) * running
         seen[rows] |= observed
@@ -203,7 +191,6 @@ def diagnose(
     make_env = trained.environments(condition.missingness, condition.noise, removed, complete=True)
     policy = trained.observing_policy
     run_episodes(policy, make_env, episodes=episodes, mode=mode, seed=seed, watch=watch)
-    add_held()
     return tally
 
 

@@ -5,7 +5,7 @@ Readings are standardised here: one unit is one standard deviation of that senso
 
 import copy
 from collections.abc import Iterator
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,17 +24,17 @@ class Sequences(NamedTuple):
     observed: Tensor
     reset: Tensor
 
-    def rows(self, index: Tensor) -> Self:
+    def rows(self, index: Tensor) -> "Sequences":
         """Return some of the rows."""
-        return self._make(x[index] for x in self)
+        return Sequences(*(x[index] for x in self))
 
-    def cut(self, length: int) -> Self:
+    def cut(self, length: int) -> "Sequences":
         """Return windows of a length as rows; what is added at the end is a reset each step."""
         time = self.reset.shape[1]
         added = -time % length
         ends = [torch.cat([x, x.new_zeros(len(x), added, *x.shape[2:])], 1) for x in self]
         ends[-1][:, time:] = True
-        return self._make(x.reshape(-1, length, *x.shape[2:]) for x in ends)
+        return Sequences(*(x.reshape(-1, length, *x.shape[2:]) for x in ends))
 
 
 class Estimate(NamedTuple):

@@ -77,7 +77,7 @@ class Camera:
             os.environ.setdefault("MUJOCO_GL", "egl")  # no display is needed
         options: dict[str, Any] = {"render_mode": "rgb_array", "disable_env_checker": True}
         # Gymnasium's own choice is a camera that stays where the robot started.
-        tracking = {"width": size[0], "height": size[1], "camera_name": "track"}
+        tracking: Any = {"width": size[0], "height": size[1], "camera_name": "track"}
         try:
             made = gymnasium.make(env_id, **tracking, **options)
         except TypeError:
