@@ -16,7 +16,7 @@ from evaluation.trained import TrainedAgent, load_trained_agent, save_weights
 from training.config import command
 from training.console import say
 from training.errors import UserError
-from training.run_folder import load_config, write_config, write_whole
+from training.run_folder import load_config, read_versions, write_config, write_whole
 
 _SHOWN = ["mode", "episodes", "return_mean", "return_std", "length_mean", "missing_ratio"]
 
@@ -30,7 +30,7 @@ def run(config: dict[str, Any]) -> int:
     if out.exists() and (not out.is_dir() or any(out.glob("checkpoints"))):
         raise UserError(f"`out` must be a folder for an agent, {out} is a file or a run folder.")
     trained = load_trained_agent(folder)
-    table, versions = _final_evaluation(folder), _versions(folder)
+    table, versions = _final_evaluation(folder), read_versions(folder)
     out.mkdir(parents=True, exist_ok=True)
     write_config(out, load_config(folder))
     write_whole(out / "versions.json", json.dumps(versions, indent=2) + "\n")
@@ -50,11 +50,6 @@ def _final_evaluation(folder: Path) -> pd.DataFrame:
     if table.empty:
         raise UserError(f"`{folder}` has no final evaluation yet: its run has not ended.")
     return table
-
-
-def _versions(folder: Path) -> dict[str, str]:
-    path = folder / "versions.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def _card(trained: TrainedAgent, table: pd.DataFrame, versions: dict[str, str], out: Path) -> str:

@@ -1,6 +1,5 @@
 """Run folders as three tables: one row a run, a point of its learning curve, an evaluation."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,7 +11,7 @@ from evaluation.episodes import over_episodes
 from evaluation.points import faults_name, method_name, missingness_name
 from scipy.stats import hmean
 from training.errors import UserError
-from training.run_folder import read_config, read_table
+from training.run_folder import read_config, read_table, read_versions
 
 # A mean is taken over the seeds of one of these.
 GROUP = ["task", "method", "settings", "trained_on", "noise_sigma"]
@@ -124,8 +123,7 @@ def _run(
     path = folder / "episodes.csv"
     episodes = read_table(path, ["frames", "return"]) if path.is_file() else curve.head(0)
     best = episodes[episodes.frames <= WITHIN]["return"].nlargest(10)
-    path = folder / "versions.json"
-    versions = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    versions = read_versions(folder)
     final = bool((tested.source == "final").any() or not config["evaluation"]["final_episodes"])
     return {
         "run": folder.name,

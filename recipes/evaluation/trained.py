@@ -13,8 +13,8 @@ from safetensors.torch import save_file
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from training.agent import Agent, add_primers, load_agent, make_agent
-from training.checkpoint import fitting
+from training.agent import Agent, add_primers, make_agent
+from training.checkpoint import fitting, last_checkpoint, load_checkpoint
 from training.envs import env_name, make_env
 from training.errors import UserError
 from training.run_folder import EVALUATION_COLUMNS, load_config, whole
@@ -111,13 +111,12 @@ def load_trained_agent(
     ``robust``: "huber", "imq" or "none", the update that it acts with; None: as in training.
     ``threshold``: where its weights begin to fall, standard deviations.
     """
-    config, weights = load_config(folder), folder / WEIGHTS
+    config = load_config(folder)
+    path, state, frames = _read_weights(folder)
     with closing(make_env(config, num_envs=1)) as env:
-        if weights.is_file():
-            agent = make_agent(config, env)
-            frames = _load_weights(weights, agent)
-        else:
-            agent, frames = load_agent(folder, config, env)
+        agent = make_agent(config, env)
+    with fitting(str(path)):
+        agent.load_state_dict(state)
     trained = TrainedAgent(config, agent, frames)
     if robust is None:
         return trained
@@ -142,17 +141,19 @@ def save_weights(folder: Path, trained: TrainedAgent) -> None:
         save_file(tensors, temporary, metadata={"frames": str(trained.frames)})
 
 
-def _load_weights(path: Path, agent: Agent) -> int:
-    """Give an agent its weights; return the environment steps that it was trained for."""
+def _read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], int]:
+    """Return the file of an agent's weights, what it holds, and the environment steps trained."""
+    path = folder / WEIGHTS
+    if not path.is_file():
+        path = last_checkpoint(folder)
+        checkpoint = load_checkpoint(path)
+        return path, checkpoint["agent"], checkpoint["progress"]["frames"]
     try:
         with safe_open(path, "pt") as file:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            frames = int(file.metadata()["frames"])
+            return path, weights, int(file.metadata()["frames"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"`{path}` can't be read as weights: is it damaged?") from error
-    with fitting(str(path)):
-        agent.load_state_dict(weights)
-    return frames
 
 
 def evaluate_training(

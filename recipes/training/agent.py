@@ -1,15 +1,10 @@
 """The agent: normalisation, belief module, policy head and value head.
 
-A run's folder holds all that it takes to build one, and to read one back::
-
-    config = load_config(folder)
-    env = make_env(config, num_envs=4)
-    agent, frames = load_agent(folder, config, env)   # add_primers(env, agent) makes env step it
+``evaluation.trained.load_trained_agent`` reads one back from the folder of its run.
 """
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 import torch
 from beliefs import Belief
@@ -29,7 +24,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.modules.utils import get_primers_from_module
 
 from torchrl_drbpn.modules import MaskedObservationNorm
-from training.checkpoint import fitting, last_checkpoint, load_checkpoint
+from training.checkpoint import fitting
 from training.config import build
 from training.envs import COMPLETE
 from training.errors import UserError
@@ -106,17 +101,6 @@ def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
     belief: Belief = build("belief", config.belief, **sizes)
     heads = build("heads", config.heads, feature_dim=belief.feature_dim, **sizes)
     return Agent(norm, belief, *heads)
-
-
-def load_agent(folder: Path, config: DictConfig, env: TransformedEnv) -> tuple[Agent, int]:
-    """Build the agent of a run with the weights of its last checkpoint; return its frames too."""
-    path = last_checkpoint(folder)
-    state = load_checkpoint(path)
-    agent = make_agent(config, env)
-    with fitting(str(path)):
-        agent.load_state_dict(state["agent"])
-        frames = int(state["progress"]["frames"])
-    return agent, frames
 
 
 def start_from_pretrained(agent: Agent) -> None:

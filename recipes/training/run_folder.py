@@ -168,6 +168,12 @@ def write_versions(folder: Path) -> None:
     write_whole(folder / "versions.json", json.dumps(versions, indent=2) + "\n")
 
 
+def read_versions(folder: Path) -> dict[str, str]:
+    """Read what :func:`write_versions` wrote; nothing if a run was killed before."""
+    path = folder / "versions.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
 def _git(*arguments: str) -> str:
     """Return what git says about this checkout, or nothing."""
     command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent), *arguments]
