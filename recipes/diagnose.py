@@ -23,7 +23,7 @@ from rendering.style import save_figure
 from training.config import check_limits, check_mode, command
 from training.console import say
 from training.errors import UserError
-from training.run_folder import write_whole
+from training.run_folder import write_table
 
 from torchrl_drbpn import BeliefDivergedError
 
@@ -66,8 +66,7 @@ def run(config: dict[str, Any]) -> int:
     out.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
         if rows:
-            text = pd.DataFrame(rows).to_csv(index=False, float_format="%.6g")
-            write_whole(out / f"{name}.csv", text)
+            write_table(out / f"{name}.csv", rows)
         else:
             (out / f"{name}.csv").unlink(missing_ok=True)  # of an earlier diagnosis
     return _draw(out)

@@ -24,7 +24,7 @@ from tensordict import TensorDict
 from training.config import build, check_limits, command
 from training.console import say
 from training.errors import UserError
-from training.run_folder import write_whole
+from training.run_folder import write_table
 
 from torchrl_drbpn import BeliefFilter, MaskedObservationNorm
 
@@ -86,7 +86,7 @@ def run(config: dict[str, Any]) -> int:
     out = Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)
     table = pd.DataFrame(rows(found, held.observation, hidden, log.names, norm.std))
-    write_whole(out / "table.csv", table.to_csv(index=False, float_format="%.6g"))
+    write_table(out / "table.csv", table)
     figure = _figure(found, held, hidden, log.names, [log.episodes[i] for i in test])
     save_figure(figure, out / "estimates.png", dpi=90, palette=True)
     weights = {f"norm.{k}": v for k, v in norm.state_dict().items()}

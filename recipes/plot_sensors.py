@@ -9,7 +9,6 @@ are drawn together; runs that have not learned these are left out.
 from math import inf
 from typing import Any, Literal
 
-import pandas as pd
 import torch
 from analysis.sensor_figures import covariance_figure, ranking_figure
 from evaluation.folders import find_folders, output_folder, with_checkpoint
@@ -19,7 +18,7 @@ from rendering.style import save_figure
 from training.config import check_limits, command
 from training.console import say
 from training.errors import UserError
-from training.run_folder import write_whole
+from training.run_folder import write_table
 
 
 def run(config: dict[str, Any]) -> int:
@@ -43,8 +42,8 @@ def run(config: dict[str, Any]) -> int:
     for trained, model in sorted(members, key=lambda member: member[1].seed):
         groups.setdefault(title(trained), []).append(model)
     out.mkdir(parents=True, exist_ok=True)
-    table = pd.DataFrame([row for member in members for row in ranking_rows(*member)])
-    write_whole(out / "sensor_ranking.csv", table.to_csv(index=False, float_format="%.6g"))
+    rows = [row for member in members for row in ranking_rows(*member)]
+    write_table(out / "sensor_ranking.csv", rows)
     figures = {
         "sensor_ranking": ranking_figure(groups, orders=config["orders"], seed=config["seed"]),
         "observation_covariance": covariance_figure(groups, correlation=config["correlation"]),

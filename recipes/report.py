@@ -13,14 +13,14 @@ from typing import Any
 import pandas as pd
 from analysis.figures import learning_curves, robustness
 from analysis.page import page
-from analysis.runs import Study, read_runs, write_table
+from analysis.runs import Study, read_runs
 from analysis.tables import derived_tables
 from evaluation.folders import find_folders
 from rendering.style import save_figure
 from training.config import check_limits, command
 from training.console import say
 from training.errors import UserError
-from training.run_folder import write_whole
+from training.run_folder import write_table, write_whole
 
 NOTES_FILE = "notes.md"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from analysis.figures import draw_evaluation, episode_summary
-from analysis.runs import read_runs, write_table
+from analysis.runs import read_runs
 from analysis.statistics import interquartile_mean, interval, probability_of_improvement, ratio
 from analysis.tables import derived_tables, point_kind, point_order
 from evaluation.points import method_name, missingness_name
@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from recipe_tools import ROOT, make_config, refused
 from rendering.style import legend_below, panel_grid
 from report import run
-from training.run_folder import read_config, write_config
+from training.run_folder import read_config, write_config, write_table
 
 ASKED = {"run": None, "out": None, "from": None, "title": None}
 ASKED |= {"table": None, "reference": "drbpn", "rows": 100, "unfinished": False}

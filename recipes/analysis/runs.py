@@ -11,7 +11,7 @@ from evaluation.episodes import over_episodes
 from evaluation.points import faults_name, method_name, missingness_name
 from scipy.stats import hmean
 from training.errors import UserError
-from training.run_folder import read_config, read_table, read_versions
+from training.run_folder import read_config, read_table, read_versions, write_table
 
 # A mean is taken over the seeds of one of these.
 GROUP = ["task", "method", "settings", "trained_on", "noise_sigma"]
@@ -52,7 +52,7 @@ class Study:
     evaluation: pd.DataFrame
 
     def write(self, folder: Path) -> None:
-        """Write the tables, six significant digits."""
+        """Write the tables."""
         for field in fields(self):
             write_table(folder / f"{field.name}.csv", getattr(self, field.name))
 
@@ -64,11 +64,6 @@ class Study:
             for name in {"settings", "overrides"} & {*table}:  # empty: a column without a text
                 table[name] = table[name].astype(str).fillna("")
         return cls(*tables)
-
-
-def write_table(path: Path, rows: Any) -> None:
-    """Write a CSV file, numbers with six significant digits."""
-    pd.DataFrame(rows).to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
 
 
 def read_runs(

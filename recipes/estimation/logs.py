@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
-from training.config import nearest
+from training.config import nearest, one_line
 from training.errors import UserError
 
 _READERS = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
@@ -104,8 +104,7 @@ def _read_table(path: str | None) -> pd.DataFrame:
     except ImportError as error:
         raise UserError("`data`: Parquet needs pyarrow: pip install pyarrow.") from error
     except Exception as error:  # whatever a parser raises
-        text = " ".join(str(error).split())[:200]
-        raise UserError(f"`data`: {path} can't be read as a table: {text}") from error
+        raise UserError(f"`data`: {path} can't be read as a table: {one_line(error)}") from error
 
 
 def _columns(table: pd.DataFrame, key: str, names: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ import pandas as pd
 import torch
 from joblib import Parallel, delayed
 from training.errors import UserError
-from training.run_folder import write_whole
+from training.run_folder import write_table
 
 from evaluation.conditions import Condition, removed_sensors
 from evaluation.episodes import StoppingPolicy, evaluate
@@ -89,7 +89,7 @@ class Table:
 
     def write(self) -> None:
         """Write the table whole."""
-        write_whole(self.path, self.rows.fillna("").to_csv(index=False, lineterminator="\n"))
+        write_table(self.path, self.rows)
 
 
 def _identity(trained: TrainedAgent) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
+from training.config import one_line
 from training.console import say
 from training.envs import env_name
 from training.errors import UserError
@@ -142,8 +143,7 @@ def record_episode(
                 camera = camera or Camera(task, picture_size)
                 pictures.append(camera.picture(env.base_env.envs[0].unwrapped))
             except Exception as error:  # each OpenGL back end fails in its own way
-                reason = " ".join(str(error).split())[:200] or type(error).__name__
-                say(f"no pictures of the robot, off-screen rendering failed: {reason}")
+                say(f"no pictures of the robot, off-screen rendering failed: {one_line(error)}")
                 picture_size = None
         return observing(data)
 

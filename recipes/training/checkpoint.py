@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 
+from training.config import one_line
 from training.errors import UserError
 from training.run_folder import whole
 
@@ -119,7 +120,7 @@ def fitting(source: str) -> Iterator[None]:
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise UserError(
             f"`{source}` does not fit the settings of this run (another task, belief or size?): "
-            f"{' '.join(str(error).split())[:300]}"
+            f"{one_line(error)}"
         ) from error
 
 

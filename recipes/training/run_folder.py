@@ -56,6 +56,12 @@ def write_whole(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_table(path: Path, rows: Any) -> None:
+    """Write a CSV file whole or not at all, numbers with six significant digits."""
+    table = pd.DataFrame(rows)
+    write_whole(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+
+
 def read_table(path: Path, needed: Iterable[str], **options: Any) -> pd.DataFrame:
     """Read a CSV file; a last row without an end was being written, and is left out."""
     try:
@@ -78,7 +84,7 @@ class Table:
         if up_to_frames is not None and path.exists():
             rows = read_table(path, ["frames"], dtype=str)
             kept = rows[rows.frames.astype(int) <= up_to_frames].reindex(columns=self.columns)
-        write_whole(path, kept.to_csv(index=False, lineterminator="\n"))
+        write_table(path, kept)
 
     def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Append rows; an absent value or None is an empty cell, others are left out."""
