@@ -142,11 +142,8 @@ class TransformerBelief(TensorDictModuleBase):
             width, obs_dim, action_dim, init_std=init_std, min_std=min_std
         )
         self.in_keys = [OBSERVATION, "observed", "previous_action", "is_init", *_STATE]
-        self.out_keys = [
-            "features",
-            ("belief", "log_likelihood"),
-            *(("next", *key) for key in _STATE),
-        ]
+        following = [("next", *key) for key in _STATE]
+        self.out_keys = ["features", ("belief", "log_likelihood"), *following]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Make the transform that puts the memory into the environment."""

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 from training.config import nearest, one_line
 from training.errors import UserError
 
@@ -59,30 +60,25 @@ def read_log(
             )
     if (empty := table[column].isna()).any():
         raise UserError(f"`episode`: column `{column}` is empty in row {empty.argmax() + 1}.")
-    groups = list(table.groupby(column, sort=False).indices.items())
-    longest = max(len(rows) for _, rows in groups)
-    shape = len(groups), longest
-    observations = np.full((*shape, len(seen)), np.nan)
-    previous = np.zeros((*shape, max(1, len(moves))), np.float32)
-    reset = np.ones(shape, bool)
-    for i, (_, rows) in enumerate(groups):
+    if not moves:
+        actions = np.zeros((len(table), 1))
+    names, readings, previous = [], [], []
+    for name, rows in table.groupby(column, sort=False).indices.items():
         rows = np.sort(rows)
-        observations[i, : len(rows)], reset[i, 1 : len(rows)] = values[rows], False
-        if moves and (gaps := np.isnan(actions[rows[:-1]]).any(1)).any():
+        before = actions[rows[:-1]]
+        if (gaps := np.isnan(before).any(1)).any():
             raise UserError(
                 f"`action`: a cell is empty in row {rows[gaps.argmax()] + 1}; only readings may "
                 "be missing."
             )
-        previous[i, 1 : len(rows), : len(moves)] = actions[rows[:-1]]
-    observed = ~np.isnan(observations)
-    return Log(
-        torch.from_numpy(np.where(observed, observations, 0.0)),
-        torch.from_numpy(observed),
-        torch.from_numpy(previous),
-        torch.from_numpy(reset),
-        seen,
-        [str(name) for name, _ in groups],
-    )
+        names.append(str(name))
+        readings.append(torch.from_numpy(values[rows]))
+        previous.append(torch.from_numpy(np.pad(before, ((1, 0), (0, 0)))).float())
+    padded = pad_sequence(readings, batch_first=True, padding_value=torch.nan)
+    observed, step = ~padded.isnan(), torch.arange(padded.shape[1])
+    reset = (step == 0) | (step >= torch.tensor([[len(rows)] for rows in readings]))
+    actions_before = pad_sequence(previous, batch_first=True)
+    return Log(padded.where(observed, 0.0), observed, actions_before, reset, seen, names)
 
 
 def _read_table(path: str | None) -> pd.DataFrame:
