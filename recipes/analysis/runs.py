@@ -166,12 +166,9 @@ def _over_episodes(episodes: pd.DataFrame, table: str) -> pd.DataFrame:
 def _thinned(curve: pd.DataFrame, rows: int) -> pd.DataFrame:
     """Return a learning curve of at most ``rows`` rows; the return is a mean over 100 episodes."""
     part = np.arange(len(curve)) * min(rows, len(curve)) // max(1, len(curve))
-    columns: dict[str, Any] = {"missing_ratio": "mean", "log_likelihood": "mean"}
-    columns |= {"steps_per_second": hmean}
-    means = curve.groupby(part).agg(columns)
-    return pd.concat(
-        [curve.groupby(part)[["frames", "return"]].nth(-1).reset_index(drop=True), means], axis=1
-    )
+    columns: dict[str, Any] = {"frames": "last", "return": lambda values: values.iloc[-1]}
+    columns |= {"missing_ratio": "mean", "log_likelihood": "mean", "steps_per_second": hmean}
+    return curve.groupby(part).agg(columns)
 
 
 def _name_settings(runs: pd.DataFrame, configs: Sequence[Mapping[str, Any]]) -> None:

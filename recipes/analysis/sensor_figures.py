@@ -10,6 +10,7 @@ from evaluation.sensor_choice import SensorModel
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rendering.style import STYLE, legend_below
+from torch.nn.functional import pad
 
 _D, _A, _RANDOM = "#1f6fb4", "#d1622b", "#8a8f94"
 _DASHES: Any = (0, (4, 2))
@@ -80,6 +81,12 @@ def mean_places(models: Sequence[SensorModel], criterion: Literal["D", "A"]) -> 
     return (orders.argsort(-1) + 1).double().mean(0).numpy()
 
 
+def _curves(model: SensorModel, order: torch.Tensor) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return information and variance left after each sensor of an order, from none on."""
+    information, left = model.along(order)
+    return pad(information, (1, 0)).numpy(), pad(left, (1, 0), value=1.0).numpy()
+
+
 def _draw_curves(axes: Sequence[Any], models: Sequence[SensorModel], orders: torch.Tensor) -> None:
     """Draw information and variance left over the number of sensors, from none to all."""
     count = np.arange(len(models[0].names) + 1)
@@ -87,22 +94,15 @@ def _draw_curves(axes: Sequence[Any], models: Sequence[SensorModel], orders: tor
         ("A", _A, _DASHES, "A-optimal: variance first"),
         ("D", _D, "-", "D-optimal: information first"),
     )
-    for row, (axis, start) in enumerate(zip(axes, (0.0, 1.0), strict=True)):
-
-        def curves(
-            model: SensorModel, order: torch.Tensor, row: int = row, start: float = start
-        ) -> NDArray[Any]:
-            values = model.along(order)[row].numpy()
-            return np.concatenate([np.full((*values.shape[:-1], 1), start), values], -1)
-
+    for row, axis in enumerate(axes):
         # The same orders for every belief, so that the band is one of means as the lines are.
-        random = np.mean([curves(model, orders) for model in models], axis=0)
+        random = np.mean([_curves(model, orders)[row] for model in models], axis=0)
         low, high = np.quantile(random, _BAND, axis=0)
         name = "random order, 5 to 95 %"
         axis.fill_between(count, low, high, color=_RANDOM, alpha=0.35, lw=0, label=name)
         axis.plot(count, random.mean(0), color=_RANDOM, lw=1.2)
         for criterion, colour, dashes, name in looks:
-            seeds = [curves(model, model.ranking(criterion)) for model in models]
+            seeds = [_curves(model, model.ranking(criterion))[row] for model in models]
             axis.plot(count, np.transpose(seeds), color=colour, lw=0.7, alpha=0.45)
             axis.plot(count, np.mean(seeds, axis=0), color=colour, lw=2.0, ls=dashes, label=name)
         axis.set_xlim(0, count[-1])
