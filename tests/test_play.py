@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import play
 import pytest
+from evaluation.conditions import removed_sensors
 from evaluation.trained import load_trained_agent
 from evaluation_tools import configured, evaluate, parse
 from gymnasium.envs.classic_control import PendulumEnv
@@ -38,8 +39,10 @@ def show(folder: Path, out: Path | None, **changes: Any) -> int:
 def record(folder: Path, point: str = "mcar:0.5", **changes: Any) -> Recording:
     """Record the episode that :func:`show` shows."""
     trained = load_trained_agent(folder)
+    condition = parse(point, trained.settings)
+    removed = removed_sensors(condition, trained, episodes=1, reduction_seed=0)
     options = {"mode": "sampled", "seed": 4, "start": 0, "steps": 6} | changes
-    return record_episode(trained, parse(point, trained.settings), **options)
+    return record_episode(trained, condition, removed, **options)
 
 
 def near(pixels: np.ndarray, colour: str, tolerance: float = 25) -> np.ndarray:
