@@ -9,6 +9,7 @@ import contextlib
 import sys
 import time
 import warnings
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from tqdm import tqdm
 from training.agent import add_primers, make_agent, start_from_pretrained
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint, save_checkpoint
-from training.config import build, checked, command_line, explained, one_line, run_command
+from training.config import build, checked, explained, one_line, run_command
 from training.console import BAR, StopRequest, say, show, stop_request
 from training.envs import env_name, make_env
 from training.errors import DivergedError, EnvironmentFault, UserError
@@ -255,19 +256,17 @@ def _summary(rows: list[dict[str, Any]]) -> str:
     )
 
 
-def job(config: DictConfig) -> int:
-    """Run one job of the command line."""
-    words, folder = command_line(), Path(HydraConfig.get().runtime.output_dir)
+def job(config: DictConfig, words: Sequence[str], folder: Path) -> int:
+    """Run one job of the command line, by the words of it."""
     config = checked(config, words)
     if config.resume is not None:
         config = resumed_config(config, words, folder)
     return train(config, folder)
 
 
-def cell(config: DictConfig) -> int:
+def cell(config: DictConfig, words: Sequence[str], folder: Path) -> int:
     """Run one job of a sweep, from wherever its folder stands."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    wanted = continued(checked(config, command_line()), folder)
+    wanted = continued(checked(config, words), folder)
     if wanted is None:
         return 0
     status = train(wanted, folder)
@@ -279,10 +278,11 @@ def cell(config: DictConfig) -> int:
 @hydra.main(version_base="1.3", config_path="../conf", config_name="config")
 def main(config: DictConfig) -> tuple[str, str] | None:
     """Start from the command line."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
-    outcome = run_cell(lambda: cell(config), folder) if sweeping else None
-    status = 0 if sweeping else explained(lambda: job(config))
+    hydra_config = HydraConfig.get()
+    folder, words = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
+    sweeping = hydra_config.mode == RunMode.MULTIRUN
+    outcome = run_cell(lambda: cell(config, words, folder), folder) if sweeping else None
+    status = 0 if sweeping else explained(lambda: job(config, words, folder))
     # Hydra makes the folder before any setting is looked at: leave none behind for a bad one.
     with contextlib.suppress(OSError):
         folder.rmdir()

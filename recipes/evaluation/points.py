@@ -4,8 +4,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from training.config import GROUPINGS
-
 
 def _number(least: float = 0.0, most: float = math.inf) -> Callable[[str], float]:
     def read(text: str) -> float:
@@ -21,7 +19,8 @@ def _one_of(*words: str) -> Callable[[str], str]:
     return lambda text: words[words.index(text)]
 
 
-_SHARE, _GROUP_BY = _number(most=1.0), ("group_by", _one_of(*GROUPINGS), "sensor")
+_SHARE = _number(most=1.0)
+_GROUP_BY = ("group_by", _one_of("sensor", "joint", "kind"), "sensor")
 # Of each family what follows its name: a key of conf, how it is read, and what it is where the text
 # ends before; without that it must be there. None and False end the text.
 FIELDS: dict[str, tuple[tuple[Any, ...], ...]] = {

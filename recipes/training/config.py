@@ -12,7 +12,6 @@ from typing import Any, cast
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -21,7 +20,6 @@ from torchrl_drbpn import BeliefDivergedError
 from training.errors import UserError
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPINGS = ("sensor", "joint", "kind")
 _USER_ERROR = 2
 # What ends in one line; of a belief where a learned model runs open loop.
 EXPECTED = (UserError, BeliefDivergedError, HydraException, OmegaConfBaseException)
@@ -260,8 +258,3 @@ def _names(file: str) -> list[str]:
     parents = {key[:i] for key in keys for i in range(len(key)) if key[i] == "."}
     groups = [path.name for path in CONF.iterdir() if path.is_dir() and file == "config"]
     return sorted({*keys, *parents, *groups})
-
-
-def command_line() -> list[str]:
-    """Return the overrides of the job that Hydra runs."""
-    return list(HydraConfig.get().overrides.task)
