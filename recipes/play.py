@@ -1,9 +1,8 @@
 """Show an agent at work: ``python recipes/play.py run=<folder> point=mcar:0.5 out=film.gif``.
 
-The agent acts for one episode. The film, or the picture with ``out=belief.png``, shows the robot,
-which of its sensors arrive at each step and, for some of them, the true value, what arrived, the
-gaps, and the belief with its 95 % interval. An agent without a belief is shown with its sensors
-alone.
+The film of an episode, or the picture with ``out=belief.png``, shows the robot, which of its
+sensors arrive at each step and, for some of them, the true value, what arrived, the gaps, and the
+belief, if there is one, with its 95 % interval.
 """
 
 import importlib.util

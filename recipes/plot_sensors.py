@@ -1,9 +1,8 @@
 """Draw what beliefs learned about their sensors: ``python recipes/plot_sensors.py 'run=runs/*'``.
 
 From the last checkpoint of each run: which sensors hold most information on the state by the
-learned H, P and R (sensor_ranking.png, sensor_ranking.csv), and the covariance H P H' + R of what
-they read in one step (observation_covariance.png). Runs of one task, method and training corruption
-are drawn together; runs that have not learned these are left out.
+learned H, P and R (sensor_ranking.png, .csv), and the covariance H P H' + R of what they read in
+one step (observation_covariance.png). Runs that have not learned these are left out.
 """
 
 from math import inf

@@ -16,11 +16,10 @@ Row = dict[str, Any]
 class Resampling:
     r"""Draw episodes with replacement: how far would a number be off with other episodes?
 
-    Entries of one episode are correlated, those of two are not: whole episodes are drawn (the
-    bootstrap over clusters), and a number is a ratio of sums over the drawn ones. Of few episodes
-    the 95 % percentiles are too narrow (91 % of ten); the interval takes those that a Student
-    interval of a mean would reach: :math:`\Phi(\mp t_{n-1} \sqrt{n / (n - 1)})`, the expanded
-    percentile interval of Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015.
+    Entries of one episode are correlated: whole episodes are drawn. Of few episodes the 95 %
+    percentiles are too narrow; the interval takes those that a Student interval of a mean would
+    reach: :math:`\Phi(\mp t_{n-1} \sqrt{n / (n - 1)})`, the expanded percentile interval of
+    Hesterberg, *What Teachers Should Know About the Bootstrap*, 2015.
     """
 
     def __init__(self, episodes: int, resamples: int, seed: int) -> None:

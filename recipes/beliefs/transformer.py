@@ -112,8 +112,7 @@ class TransformerBelief(TensorDictModuleBase):
 
     The recurrent state is the memory: normalised inputs of every layer, of which the current
     weights make keys and values. No gradient flows into it. A step seen alone and the same step
-    seen in a sequence give the same features, as long as the parameters stay. The auxiliary task is
-    that of the recurrent networks.
+    seen in a sequence give the same features, as long as the parameters stay.
     """
 
     def __init__(

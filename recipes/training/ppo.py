@@ -49,12 +49,9 @@ def add_advantages(
 ) -> None:
     """Write values and advantages into a normalised rollout ``(environments, time)``, in place.
 
-    Where an episode goes on, the belief that follows a step is the one stored at the next step, and
-    so is its value: only where one ends, or the rollout is cut, is there another one to value.
-
-    ``recompute`` values by the current parameters: every belief is taken one step on from the
-    stored one before it. Exact for a belief without memory; with memory, what lies before that step
-    is as old as the beliefs that the sequences of the update start from.
+    Where an episode goes on, the belief that follows a step is the one stored at the next step;
+    where one ends, or the rollout is cut, there is another one to value. ``recompute`` values by
+    the current parameters: every belief is taken one step on from the stored one before it.
     """
     value = agent.one_step_value(data) if recompute else agent.value(data)
     following = data.get("next")

@@ -48,8 +48,7 @@ def scale_reward(
     the whole rollout. The mean is not subtracted: that would change which policy is best. Reward
     scaling of [Engstrom et al. 2020, Implementation matters in deep policy gradients].
 
-    Returns the scaled rewards, ``(environments, time, 1)``, and the statistics with this rollout in
-    them. The rewards are finite: ``collect`` of ppo_drbpn.py has checked them.
+    The rewards, ``(environments, time, 1)``, are finite: ``collect`` of ppo_drbpn.py has checked.
     """
     discounted, returns = statistics.discounted.to(reward), []
     for r, over in zip(reward.unbind(1), done.unbind(1), strict=True):
