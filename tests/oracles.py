@@ -35,9 +35,14 @@ def predict(
     return transition(mean, action), jacobian @ cov @ jacobian.T + transition_cov
 
 
-def _observed_rows(
-    observation: Tensor, observed: Tensor, matrix: Tensor, noise: Tensor, offset: Tensor | None
+def observed_rows(
+    observation: Tensor,
+    observed: Tensor,
+    matrix: Tensor,
+    noise: Tensor,
+    offset: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    """What arrived less its offset, and the rows of H and R that belong to it."""
     rows = observed.nonzero().squeeze(-1)
     x = observation[rows]
     if offset is not None:
@@ -45,17 +50,9 @@ def _observed_rows(
     return x, matrix[rows], noise[rows][:, rows]
 
 
-def update(
-    mean: Tensor,
-    cov: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    matrix: Tensor,
-    noise: Tensor,
-    offset: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Eq. (10) on the observed rows alone."""
-    x, h, r = _observed_rows(observation, observed, matrix, noise, offset)
+def update(mean: Tensor, cov: Tensor, *step: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Eq. (10) on the observed rows alone; `step` is what `observed_rows` takes."""
+    x, h, r = observed_rows(*step)
     if x.numel() == 0:
         return mean, cov
     s = h @ cov @ h.T + r
@@ -63,17 +60,9 @@ def update(
     return mean + gain @ (x - h @ mean), cov - gain @ h @ cov
 
 
-def log_likelihood(
-    mean: Tensor,
-    cov: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    matrix: Tensor,
-    noise: Tensor,
-    offset: Tensor | None = None,
-) -> Tensor:
+def log_likelihood(mean: Tensor, cov: Tensor, *step: Tensor | None) -> Tensor:
     """Eq. (12): the log density of the observed entries under the predicted belief."""
-    x, h, r = _observed_rows(observation, observed, matrix, noise, offset)
+    x, h, r = observed_rows(*step)
     if x.numel() == 0:
         return mean.new_zeros(())
     residual = x - h @ mean

@@ -32,14 +32,12 @@ from torchrl_drbpn.functional import (
 from torchrl_drbpn.modules import particle_model
 
 
-def run(
-    filter: ParticleFilter, data: TensorDict, begin: Tensor | None = None
-) -> tuple[ParticleOutput, ParticleNoise]:
+def run(filter: ParticleFilter, data: TensorDict) -> tuple[ParticleOutput, ParticleNoise]:
     """Sequences from zeros, with the noise they were given."""
     shape, count = data.shape, filter.num_particles
     noise = sample_noise(shape, count, filter.latent_dim, 1)
     hidden = torch.zeros(*shape, count, filter.hidden_dim, dtype=torch.float64)
-    begin = torch.zeros(shape, dtype=torch.bool) if begin is None else begin
+    begin = torch.zeros(shape, dtype=torch.bool)
     parts = (data["previous_action"], data["observation"], data["observed"])
     return filter(hidden, hidden[..., 0], begin, *parts, noise), noise
 
