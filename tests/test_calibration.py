@@ -36,6 +36,8 @@ def test_the_consistency_test_passes_errors_of_the_claimed_covariance_and_no_oth
         for claimed in (1.0, 0.8, 1.25)
     )
     assert exact.lower < exact.ratio < exact.upper
+    band = chi_square_quantile(torch.tensor([0.0005, 0.9995]), dof.sum()) / dof.sum()
+    torch.testing.assert_close(torch.stack([exact.lower, exact.upper]), band)
     assert too_small.ratio > too_small.upper
     assert too_large.ratio < too_large.lower
 
