@@ -1,13 +1,20 @@
-"""A run folder that can't be used is answered with one line, and what is in it stays."""
+"""What stops a run, what its folder holds then, and how it goes on: equal to the last bit."""
 
 import fcntl
+import os
 import random
+import re
 import resource
 import shlex
 import shutil
+import signal
+import threading
+import time
 from pathlib import Path
 
+import ppo_drbpn
 import pytest
+import torch
 from recipe_tools import (
     SMOKE,
     assembled,
@@ -18,7 +25,7 @@ from recipe_tools import (
     resume,
     run,
 )
-from training.checkpoint import last_checkpoint, load_checkpoint
+from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.errors import UserError
 from training.run_folder import Table, read_config
 
@@ -174,3 +181,174 @@ def test_a_checkpoint_of_another_shape_is_refused(smoke, overrides):
     training, _ = assembled(*SMOKE, *overrides)
     with refused("does not fit the settings of this run"):
         training.load_state_dict(state, "there")
+
+
+TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("belief=drbpn", "env=hopper", "missingness=mar"),
+        ("missingness=outages", "missingness.group_by=joint", "noise=spikes"),
+        ("belief=drbpn_propagated", "missingness=mcar"),
+    ],
+    ids=["hopper", "outages-spikes", "propagated"],
+)
+def test_a_resumed_run_equals_one_that_never_stopped(overrides, tmp_path):
+    straight = tmp_path / "straight"
+    run(straight, "experiment=smoke", *overrides)
+    broken = shutil.copytree(straight, tmp_path / "broken")
+    # The machine stopped after the second rollout's checkpoint, in the middle of a later row.
+    last_checkpoint(broken).unlink()
+    assert last_checkpoint(broken).name == "frames_000000000256.pt"
+    for table in TABLES:
+        with (broken / table).open("a") as file:
+            file.write("640,1.")
+    assert resume(broken) == 0
+    assert_same_run(straight, broken)
+
+
+@pytest.mark.slow
+def test_a_signal_saves_and_the_resumed_run_equals_one_that_never_stopped(tmp_path):
+    longer = (*SMOKE, "total_frames=2048", "evaluation.every_frames=1024")
+    straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+    run(straight, *longer)
+
+    def stop():
+        metrics = stopped / "metrics.csv"
+        while not metrics.is_file() or metrics.read_text().count("\n") < 4:
+            time.sleep(0.005)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    handler = signal.getsignal(signal.SIGTERM)
+    killer = threading.Thread(target=stop)
+    killer.start()
+    status = run(stopped, *longer)
+    killer.join()
+    assert status == 128 + signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is handler
+    rows = read_table(stopped / "metrics.csv")
+    assert 3 <= len(rows) < 16
+    assert load_checkpoint(last_checkpoint(stopped))["progress"]["frames"] == len(rows) * 128
+    assert resume(stopped) == 0
+    assert_same_run(straight, stopped)
+
+
+def test_an_evaluation_that_was_cut_short_is_made_again(folder, smoke):
+    last_checkpoint(folder).unlink()
+    state = load_checkpoint(last_checkpoint(folder))
+    assert state["progress"]["evaluated_frames"] == 256
+    state["progress"]["evaluated_frames"] = -1
+    save_checkpoint(folder, 256, state, keep=1)
+    assert resume(folder) == 0
+    assert_same_run(smoke, folder)
+
+
+def test_resuming_a_finished_run_says_so_and_changes_nothing(folder, smoke, capsys):
+    assert resume(folder) == 0
+    assert "is at its end" in capsys.readouterr().out
+    assert_same_run(smoke, folder)
+
+
+def test_a_run_that_lacks_its_final_evaluation_gets_it(folder, smoke):
+    table = folder / "evaluation.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
+    assert resume(folder) == 0
+    assert_same_run(smoke, folder)
+
+
+def test_more_frames_can_be_added_to_a_finished_run_and_none_taken_away(folder):
+    assert resume(folder, "total_frames=768") == 0
+    rows = read_table(folder / "metrics.csv")
+    assert [int(row["frames"]) for row in rows] == [128, 256, 384, 512, 640, 768]
+    assert float(rows[-1]["lr"]) == pytest.approx(1e-3 * (1 - 640 / 768))
+    before = (folder / "config.yaml").read_text()
+    with refused(r"`total_frames` must be at least the 768 .* got 256"):
+        resume(folder, "total_frames=256")
+    assert (folder / "config.yaml").read_text() == before
+
+
+@pytest.mark.parametrize("belief", ["drbpn", "gru", "none"])
+def test_a_run_that_diverges_stops_with_its_step_and_saves_nothing(tmp_path, belief):
+    folder = tmp_path / "run"
+    with refused(r"training stopped at 0 steps: .*(nan|inf|no longer finite)") as error:
+        run(folder, *SMOKE, f"belief={belief}", "optim.lr=1e30")
+    assert "checkpoint" not in str(error.value)
+    assert not list(folder.rglob("*.pt"))
+    assert not read_table(folder / "evaluation.csv")
+
+
+def test_a_run_that_diverges_later_names_its_last_good_checkpoint(tmp_path, monkeypatch):
+    collect = ppo_drbpn.collect
+
+    def spoilt(training):
+        if training.frames == 256:
+            with torch.no_grad():
+                next(training.agent.critic.parameters())[0] = torch.inf
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", spoilt)
+    folder = tmp_path / "run"
+    what = r"at 256 steps: the (loss|weight|gradient) `.*` is (nan|inf)"
+    kept = rf"Its last checkpoint, at 256 steps, is in {re.escape(str(folder))}"
+    with refused(f"{what}.* {kept}"):
+        run(folder, *SMOKE, "checkpoint.every_frames=128")
+    assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
+    assert "final" not in (folder / "evaluation.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        ("reward", "training stopped at 256 steps: the reward of environment 2 is not finite"),
+        ("observation", "training stopped at 256 steps: the observation of environment 2 is not"),
+        ("raise", "training stopped at 256 steps: the environment failed: motor on fire"),
+    ],
+)
+def test_a_fault_of_the_environment_ends_in_one_line_and_a_saved_run(
+    tmp_path, monkeypatch, fault, line
+):
+    collect, calls = ppo_drbpn.collect, []
+
+    def faulty(training):
+        calls.append(1)
+        if len(calls) == 4:  # the first gives statistics alone
+            rollout = training.collector.rollout
+
+            def broken():
+                if fault == "raise":
+                    raise RuntimeError("motor\non fire")
+                data = rollout()
+                data["next", fault][2, 5] = torch.nan
+                data["next", "observed"][2, 5] = True
+                return data
+
+            monkeypatch.setattr(training.collector, "rollout", broken)
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", faulty)
+    folder = tmp_path / "run"
+    with refused(line):
+        run(folder, *SMOKE, "checkpoint.every_frames=10000")
+    assert load_checkpoint(last_checkpoint(folder))["progress"]["frames"] == 256
+    monkeypatch.undo()
+    assert resume(folder) == 0  # with new episodes
+    assert len(read_table(folder / "metrics.csv")) == 4
+
+
+def test_an_engine_that_resets_itself_is_counted_and_said_once(tmp_path, monkeypatch, capsys):
+    collect = ppo_drbpn.collect
+
+    def wild(training):
+        if 0 < training.frames < 384:
+            training.env.base_env.envs[1].unwrapped.data.qvel[0] = 1e12
+        return collect(training)
+
+    monkeypatch.setattr(ppo_drbpn, "collect", wild)
+    assert run(tmp_path / "run", *SMOKE) == 0
+    rows = read_table(tmp_path / "run" / "metrics.csv")
+    assert [row["engine_resets"] for row in rows] == ["0", "1", "2", "2"]
+    printed = "".join(capsys.readouterr())
+    assert printed.count("reset it") == 1
+    assert "Warning" not in printed
