@@ -34,7 +34,7 @@ def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
 
 def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
     """Leave out runs before their first checkpoint, unless none has one: reading says it then."""
-    kinds = ("checkpoints/*.pt", "*.safetensors")
+    kinds = ("checkpoints/frames_*.pt", "*.safetensors")
     found = [folder for folder in folders if any(any(folder.glob(kind)) for kind in kinds)]
     for folder in folders if found else ():
         if folder not in found:
