@@ -286,7 +286,7 @@ class CorruptingTransform(Transform, ABC):
                 torch.ones_like(part, dtype=torch.bool) if mask is None else mask
                 for part, mask in zip(parts, masks, strict=True)
             ]
-            step = Step(torch.cat(parts, -1), torch.cat(masks, -1), before, tensordict)
+            step = Step(_join(parts), _join(masks), before, tensordict)
             corrupted, observed = self._corrupt(step)
             arrived = split_like(zero_missing(corrupted, observed), parts)
             written = zip(vector, parts, arrived, split_like(observed, parts), strict=True)
@@ -348,6 +348,11 @@ class CorruptingTransform(Transform, ABC):
                 )
 
 
+def _join(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+
+
 def split_like(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
     """Cut one vector into pieces as wide as `parts`."""
-    return torch.split(joined, [part.shape[-1] for part in parts], -1)
+    sizes = [part.shape[-1] for part in parts]
+    return [joined] if len(parts) == 1 else torch.split(joined, sizes, -1)
