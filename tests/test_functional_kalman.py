@@ -19,7 +19,6 @@ from torchrl_drbpn.functional.gaussian import (
     masked_cov,
     masked_log_density,
     positive_std,
-    zero_missing,
 )
 
 sized = pytest.mark.parametrize(
@@ -267,14 +266,6 @@ def test_what_stands_at_missing_entries_does_not_reach_the_density(junk):
     assert torch.isfinite(dirty.grad).all()
 
 
-def test_one_covariance_serves_a_whole_batch_of_masks():
-    residual, cov, _ = case([True] * 4, batch=16)
-    masks = torch.cartesian_prod(*[torch.tensor([False, True])] * 4)
-    shared = masked_log_density(residual, cov[0], masks)
-    each = masked_log_density(residual, cov[0].expand_as(cov), masks)
-    torch.testing.assert_close(shared, each, atol=0, rtol=0)
-
-
 @MASKS
 def test_the_masked_matrix_has_the_determinant_and_inverse_of_the_sub_matrix(mask):
     _, cov, observed = case(mask, batch=1)
@@ -294,15 +285,6 @@ def test_masking_ignores_junk_in_the_rows_of_missing_entries():
     junk[:, 1] = math.nan
     junk[:, :, 1] = math.inf
     assert torch.equal(masked_cov(junk, observed), masked_cov(cov, observed))
-
-
-@pytest.mark.parametrize("dtype", [*DTYPES, torch.float16], ids=str)
-def test_zero_missing_keeps_what_arrived_and_its_dtype(dtype):
-    values = torch.tensor([1.0, math.nan, -3.0, math.inf], dtype=dtype)
-    observed = torch.tensor([True, False, True, False])
-    filled = zero_missing(values, observed)
-    assert filled.dtype == dtype
-    assert filled.tolist() == [1.0, 0.0, -3.0, 0.0]
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)

@@ -29,34 +29,32 @@ def scramble(module: torch.nn.Module, scale: float, seed: int = 0) -> None:
             parameter.copy_(scale * torch.randn(parameter.shape, generator=g, dtype=F64))
 
 
+def assert_covariance(matrix: torch.Tensor, floor: float, cov: str) -> None:
+    eigenvalues = torch.linalg.eigvalsh(matrix)
+    assert torch.equal(matrix, matrix.mT)
+    assert (eigenvalues >= floor**2 - 1e-12 * eigenvalues[..., -1:]).all()
+    if cov == "diag":
+        assert torch.equal(matrix, torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1)))
+
+
 @pytest.mark.parametrize(("cov", "cov_network"), COVS)
 @pytest.mark.parametrize("std", [0.3, 0.06, 5.0])
 def test_q_starts_at_init_std_and_keeps_its_floor_whatever_the_parameters(cov, cov_network, std):
-    floor = 0.05
     transition = GaussianTransition(
-        STATE, ACTION, hidden_sizes=(8,), cov=cov, cov_network=cov_network, min_std=floor,
+        STATE, ACTION, hidden_sizes=(8,), cov=cov, cov_network=cov_network, min_std=0.05,
         init_std=std, dtype=F64,
     )  # fmt: skip
     assert {parameter.dtype for parameter in transition.parameters()} == {F64}
     expected = (std**2 * torch.eye(STATE, dtype=F64)).expand(7, -1, -1)
     torch.testing.assert_close(transition(*inputs()).cov, expected, rtol=1e-12, atol=1e-14)
-
-    def check(seed: int = 0) -> None:
-        q = transition(*inputs(seed=seed)).cov
-        eigenvalues = torch.linalg.eigvalsh(q)
-        assert torch.equal(q, q.mT)
-        assert (eigenvalues >= floor**2 - 1e-12 * eigenvalues[..., -1:]).all()
-        if cov == "diag":
-            assert torch.equal(q, torch.diag_embed(q.diagonal(dim1=-2, dim2=-1)))
-
     for scale, seed in itertools.product((0.5, 5.0), (0, 1)):
         scramble(transition, scale, seed)
-        check(seed)
+        assert_covariance(transition(*inputs(seed=seed)).cov, 0.05, cov)
     # where the likelihood pulls the noise to zero
     target = transition.noise.raw if not cov_network else transition.cov_layers[-1].bias
     with torch.no_grad():
         target.fill_(-1e3)
-    check()
+    assert_covariance(transition(*inputs()).cov, 0.05, cov)
 
 
 @pytest.mark.parametrize("cov_network", [False, True])
@@ -113,10 +111,8 @@ def test_r_starts_exactly_at_init_std_and_keeps_its_floor(cov, std):
     for scale in (0.5, 5.0):
         scramble(emission, scale)
         r, compact = emission.cov(), emission.compact_cov()
-        assert torch.equal(r, r.mT)
         assert torch.equal(compact, r.diagonal() if cov == "diag" else r)
-        eigenvalues = torch.linalg.eigvalsh(r)
-        assert (eigenvalues >= emission.noise.min_std**2 - 1e-12 * eigenvalues[-1]).all()
+        assert_covariance(r, emission.noise.min_std, cov)
 
 
 def test_a_fixed_matrix_is_saved_but_not_learned():

@@ -10,6 +10,7 @@ from contracts import vectors as data
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
+from transform_cases import COMPLETE
 
 from torchrl_drbpn.transforms import (
     FillLastObserved,
@@ -20,7 +21,6 @@ from torchrl_drbpn.transforms import (
     SensorReduction,
 )
 
-COMPLETE = "complete_observation"
 MISSING = partial(ObservationMissingness, "mcar", 0.5)
 MAR = partial(ObservationMissingness, "mar", 0.5)
 NOISE = partial(ObservationNoise, 0.1)

@@ -9,6 +9,7 @@ from contracts import ACTION, OBS, staircase, vectors
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import StepCounter
+from transform_cases import COMPLETE
 
 from torchrl_drbpn.functional.missingness import outage_rates, sample_working
 from torchrl_drbpn.transforms import (
@@ -20,7 +21,6 @@ from torchrl_drbpn.transforms import (
     StuckSensors,
 )
 
-COMPLETE = "complete_observation"
 GROUPS = [[0, 3], [-1]]
 
 

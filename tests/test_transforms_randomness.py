@@ -12,6 +12,7 @@ from contracts import ACTION, OBS, gym_env, saved, staircase
 from contracts import vectors as data
 from tensordict import TensorDict
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from transform_cases import CASES, COMPLETE
 
 from torchrl_drbpn.functional.missingness import missing_probability, sample_mask
 from torchrl_drbpn.transforms import (
@@ -26,8 +27,7 @@ from torchrl_drbpn.transforms import (
     seed_env,
 )
 
-COMPLETE = "complete_observation"
-KINDS = ["mcar", "mar", "nmar"]
+RANDOM = ["nmar", "noise", "spikes", "outages", "delay", "multi_rate"]
 
 
 def corrupted_gym(**kwargs):
@@ -94,16 +94,8 @@ def test_forked_workers_that_set_seed_does_not_reach_differ_too():
 
 @pytest.mark.parametrize(
     "make",
-    [
-        partial(ObservationMissingness, "nmar", 0.5),
-        partial(ObservationNoise, 0.1),
-        partial(ObservationSpikes, 0.5, 1.0),
-        partial(SensorOutages, 0.5, 3),
-        partial(ObservationDelay, 0, max_delay=3),
-        partial(ObservationMultiRate, 3, phase="random"),
-        partial(SensorDrift, 0.1),
-    ],
-    ids=["missingness", "noise", "spikes", "outages", "delay", "rates", "drift"],
+    [*(partial(CASES[name].make, seed=None) for name in RANDOM), partial(SensorDrift, 0.1)],
+    ids=[*RANDOM, "drift"],
 )
 def test_without_a_seed_two_transforms_differ_and_the_global_seed_repeats_them(make):
     def draw(transform, seed=None):
