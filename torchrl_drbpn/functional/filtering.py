@@ -110,8 +110,6 @@ def filter_sequence(
         observation: shape ``(*batch, time, obs)``; missing entries may hold anything.
         observed: bool, shape ``(*batch, time, obs)``, True = arrived.
         reset: bool, shape ``(*batch, time)``; True starts from the initial belief at this step.
-
-    Keyword Args:
         cov: filtered covariance of the step before the first, shape ``(*batch, state, state)``;
             needed, and read, where the model propagates it.
         use_stored_state: bool, shape ``(*batch, time)``; True takes the belief of the step before

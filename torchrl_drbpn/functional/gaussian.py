@@ -146,11 +146,7 @@ def full_cov(raw: Tensor, min_std: float) -> Tensor:
 
 
 def rounded_cov(cov: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return float64 covariances in another dtype, symmetric and positive definite there too.
-
-    Rounding errs by at most eps/2 sqrt(C_ii C_jj) in every entry: raising the diagonal by
-    dim * eps/2 of itself outweighs it whatever the signs.
-    """
+    """Return float64 covariances in another dtype, symmetric and positive definite there too."""
     cov = (0.5 * (cov + cov.mT)).to(dtype)
     unit = 0.5 * cov.shape[-1] * torch.finfo(dtype).eps
     return cov + torch.diag_embed(unit * cov.diagonal(dim1=-2, dim2=-1).detach())

@@ -67,8 +67,6 @@ def predict(
         transition: f, maps ``(*batch, state)`` and ``(*batch, action)`` to ``(*batch, state)``.
         transition_cov: Q, shape ``(*batch, state, state)``, or ``(state,)`` for its diagonal.
         previous_action: shape ``(*batch, action)``.
-
-    Keyword Args:
         jacobian: J, the derivative of f by the mean, shape ``(*batch, state, state)``; None for the
             constant covariance of the paper, which drops the past.
 

@@ -1,9 +1,8 @@
 """The native form of the filter: one operator on the CPU, forward and back.
 
-At the sizes of reinforcement learning (16 sequences of 16 steps, 17 sensors) PyTorch spends its
-time between the operations of the filter, not in them; ``csrc/filter.h`` holds the same sums.
-``torch.ops.torchrl_drbpn.filter_rows`` and its gradient check every tensor before they hand over a
-pointer; FakeTensors, tracing and vmap meet an ordinary operator.
+At the sizes of reinforcement learning PyTorch spends its time between the operations of the filter,
+not in them. ``torch.ops.torchrl_drbpn.filter_rows`` and its gradient check every tensor before they
+hand over a pointer to ``csrc/filter.h``.
 """
 
 import ctypes

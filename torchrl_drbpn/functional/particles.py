@@ -26,10 +26,8 @@ class ParticleNoise(NamedTuple):
     """Hold the random numbers of a step; given them the filter is deterministic.
 
     Args:
-        proposal: standard normal, shape ``(*batch, [time,] particles, latent)``; z is the
-            proposal's mean plus this times its standard deviation.
-        resampling: uniform on [0, 1), shape ``(*batch, [time,] 1)``; where systematic resampling
-            begins.
+        proposal: standard normal, shape ``(*batch, [time,] particles, latent)``.
+        resampling: uniform on [0, 1), shape ``(*batch, [time,] 1)``.
     """
 
     proposal: Tensor
@@ -44,13 +42,7 @@ class ProposalOutput(NamedTuple):
 
 
 class ParticleStep(NamedTuple):
-    """Hold what a model computes from z, each with a leading ``(*batch, particles)``.
-
-    Args:
-        emission: p(x | h, z, a) over ``obs``.
-        hidden: the next h.
-        embedding: further features of a particle.
-    """
+    """Hold p(x | h, z, a) over ``obs``, the next h, and further features, of every particle."""
 
     emission: DiagonalGaussian
     hidden: Tensor
@@ -60,8 +52,7 @@ class ParticleStep(NamedTuple):
 class ParticleModel(Protocol):
     """Declare what a model offers: two functions of all particles of all rows at once.
 
-    ``inputs``, tensors with a leading ``(*batch,)``, hold what the model computes from a step's
-    observation, mask and action; the particles of a row share them.
+    ``inputs``, ``(*batch, n)``, is what it computes from a step's observation, mask and action.
     """
 
     def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:

@@ -94,10 +94,7 @@ def _run_covariances(
     own: Tensor,
     added: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Propagate and update covariances ahead of the means; ``own`` is Q or P_0 of each step.
-
-    The predicted ones have the gradient by ``own`` alone, the filtered ones none.
-    """
+    """Return predicted covariances, with the gradient by ``own`` alone, and filtered ones."""
     given, observed = rows.reset, rows.observed
     H, R = model.emission_matrix.detach().double(), model.emission_cov.detach().double()
     if not model.information_form:

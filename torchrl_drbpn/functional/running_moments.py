@@ -23,14 +23,9 @@ _FIRST_SHARE = 1000
 
 
 class RunningMoments(NamedTuple):
-    """Hold how many values were seen, their mean and their variance, each of shape ``(*event)``.
+    """Hold how many values were seen, their mean and their population variance, each ``(*event)``.
 
-    The variance, unlike the sum of squares, does not grow with the count: it fits into float32.
-
-    Attributes:
-        n: number of observed values of each component.
-        mean: their mean, 0 where nothing was observed, units of the values.
-        var: their population variance, 0 where fewer than two were observed, squared units.
+    Where nothing was observed the mean is 0, of fewer than two values the variance.
     """
 
     n: Tensor

@@ -54,28 +54,23 @@ def select_sensors(
     - D, diagonal R: :math:`I(s; x_S)` is monotone and submodular, hence at least
       :math:`1 - 1/e` of the best set of that size [Nemhauser, Wolsey, Fisher 1978; Krause,
       Guestrin 2005; Shamaiah, Banerjee, Vikalo 2010].
-    - D with a full R (a sensor may read another one's noise alone) and A are monotone, not
-      submodular: no such bound [Bian, Buhmann, Krause, Tschiatschek 2017; Chamon, Pappas,
-      Ribeiro 2021].
+    - D with a full R and A are monotone, not submodular: no such bound [Bian, Buhmann, Krause,
+      Tschiatschek 2017; Chamon, Pappas, Ribeiro 2021].
 
     D does not depend on the units or the basis of the state, A does: for a learned state
     ``target=H`` adds up the variances of what the sensors would read without noise. Differences
-    under 1e-10 (nats for D, of tr C P C' for A) are ties, which go to the lowest index.
+    under 1e-10 (nats for D, of tr C P C' for A) are ties, which go to the lowest index. Computed in
+    float64, without gradient.
 
     Args:
         emission_matrix: H, shape ``(*batch, obs, state)``.
         predicted_cov: P, the covariance before the readings, shape ``(*batch, state, state)``.
         emission_cov: R, shape ``(*batch, obs, obs)``, or its diagonal ``(obs,)``.
         count: how many to choose.
-
-    Keyword Args:
         criterion: "D", the log-determinant, or "A", the trace.
         always: sensors that are read in any case and not chosen: indices, or bool ``(obs,)``.
         target: C, the combinations of the state whose variances count for "A", shape
             ``(*batch, target, state)``; None: the whole state, C = I.
-
-    Returns:
-        The :class:`SensorSelection`; computed in float64, no gradient.
 
     Raises:
         ValueError: for matrices that do not fit, are not finite or no covariances, an unknown

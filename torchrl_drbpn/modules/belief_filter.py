@@ -52,8 +52,6 @@ class BeliefFilter(nn.Module):
     Args:
         obs_dim, action_dim: components of an observation, of an action.
         state_dim: number of latent components; default ``min(obs_dim, 32)``.
-
-    Keyword Args:
         transition: a module of (mean, action) that returns the predicted (mean, cov); default
             :class:`GaussianTransition`, residual where state <= obs.
         emission: default :class:`LinearGaussianEmission`.
@@ -240,7 +238,6 @@ class BeliefFilter(nn.Module):
                     "standard deviations, or mend its module."
                 )
 
-    # ------------------------------------------------------------------ one step
     def step(
         self,
         mean: Tensor,
@@ -276,7 +273,6 @@ class BeliefFilter(nn.Module):
 
         return checked(run, self.validate, *given[:4])
 
-    # ------------------------------------------------------------------ a sequence
     def forward(
         self,
         mean: Tensor,

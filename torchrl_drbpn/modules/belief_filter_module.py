@@ -36,8 +36,6 @@ class BeliefFilterModule(RecurrentBeliefModule):
 
     Args:
         filter: the filter.
-
-    Keyword Args:
         in_key, out_key: the key of the observation, of the features, when every other keeps its
             name.
         in_keys: the entries read, in the order ``observation, observed, previous_action, is_init,

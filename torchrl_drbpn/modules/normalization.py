@@ -35,8 +35,6 @@ class MaskedObservationNorm(TensorDictModuleBase):
 
     Args:
         obs_dim: components of an observation.
-
-    Keyword Args:
         clip: largest magnitude of a standardised entry, in deviations; None for no limit.
         eps: added to the variance, squared observation units.
         missing: "zero": an entry that did not arrive reads 0. "keep": it is standardised too,

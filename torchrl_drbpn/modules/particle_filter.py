@@ -17,18 +17,14 @@ class ParticleFilterModule(RecurrentBeliefModule):
     """Read what arrived, write features of particles: a :class:`ParticleFilter` with keys.
 
     Deep variational reinforcement learning [DVRL 2018] in the place of a ``GRUModule`` or a
-    :class:`~torchrl_drbpn.BeliefFilterModule`, whose rules for modes and recurrent state hold
-    here too. ``("belief", "log_likelihood")`` is the log of the particles' mean weight, so
-    :class:`~torchrl_drbpn.BeliefModelLoss` of it is minus the evidence lower bound, and
-    :class:`~torchrl_drbpn.DRBPNLoss` serves unchanged. A step gives the same particles wherever it
-    is computed, so that PPO's ratio is 1 before the first update: see :meth:`ParticleFilter.noise`.
+    :class:`~torchrl_drbpn.BeliefFilterModule`, whose arguments, errors and rules for modes and
+    recurrent state hold here too. ``("belief", "log_likelihood")`` is the log of the particles'
+    mean weight: :class:`~torchrl_drbpn.BeliefModelLoss` of it is minus the evidence lower bound. A
+    step gives the same particles wherever it is computed: see :meth:`ParticleFilter.noise`.
 
     Args:
         filter: the filter.
-
-    Keyword Args:
-        in_keys: as in :class:`~torchrl_drbpn.BeliefFilterModule`, as are the other arguments and
-            errors; ``("recurrent", "particles"), ("recurrent", "log_weight")`` take the place of
+        in_keys: ``("recurrent", "particles"), ("recurrent", "log_weight")`` take the place of
             ``("recurrent", "mean")``: a list has four or seven entries.
         out_keys: chosen from ``features``, ``("belief", "log_likelihood")`` (the default) and, only
             where asked for, ``("belief", "observation")`` (the emission's mean, averaged over the

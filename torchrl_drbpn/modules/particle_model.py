@@ -42,8 +42,6 @@ class ParticleFilter(nn.Module):
 
     Args:
         obs_dim, action_dim: components of an observation, of an action.
-
-    Keyword Args:
         num_particles: K; one particle is a sequential variational auto-encoder.
         hidden_dim: components of h, and of the features.
         latent_dim: components of z.
@@ -203,7 +201,6 @@ class ParticleFilter(nn.Module):
         _, last = torch.gru(flat, start, weights, True, 1, 0.0, self.training, False, True)
         return last.reshape(*each.shape[:-2], self.hidden_dim)
 
-    # ------------------------------------------------------------------ noise
     @torch.no_grad()
     def noise(
         self, previous_action: Tensor, observation: Tensor, observed: Tensor, age: Tensor

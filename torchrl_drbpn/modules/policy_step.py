@@ -13,7 +13,7 @@ from torchrl_drbpn.functional import (
     tril_to_vector,
     zero_missing,
 )
-from torchrl_drbpn.functional.gaussian import rounded_cov
+from torchrl_drbpn.functional.gaussian import masked_cov, rounded_cov
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
 from torchrl_drbpn.modules.state_space import GaussianTransition, jacobian_of
@@ -25,18 +25,15 @@ class PolicyStep(nn.Module):
     .. math::
         m_t = m^-_t + K_t (x_t - H m^-_t - B a_{t-1} - d), \qquad a_t = \mu(m_t)
 
-    A frozen copy of the policy's modules, one step at a time, with the mean action. What the
-    parameters alone determine is computed once, here, and kept in buffers. It has no TensorDict
-    and no branch on values, so ``torch.export.export`` takes it, with a dynamic batch too, and
-    ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time; its ``inductor_configs``
-    "freezing" and "max_autotune" together compile the matrix products too.
+    A frozen copy of the policy's modules, one step at a time, with the mean action. It has no
+    TensorDict and no branch on values, so ``torch.export.export`` takes it, with a dynamic batch
+    too, and ``torch._inductor.aoti_compile_and_package`` compiles it ahead of time; its
+    ``inductor_configs`` "freezing" and "max_autotune" compile the matrix products too.
 
     Args:
         belief: the belief module; its filter's ``robust`` is kept.
         head: maps ``features`` ``(*batch, features)`` to the action ``(*batch, action)``, or to a
             tuple that begins with it, such as (loc, scale).
-
-    Keyword Args:
         norm: standardises the observations first, where the belief reads standardised ones.
         action_low, action_high: limits of an action, shape ``(action,)``, action units; None: none.
         sequential: take the readings one by one, which needs no Cholesky factor: for ONNX.
@@ -99,7 +96,6 @@ class PolicyStep(nn.Module):
         P = torch.stack([model.constant_cov() if self.constant else P0, P0]).double()
         self.matrix, self.noise, self.prior = nn.Buffer(H), nn.Buffer(R), nn.Buffer(P)
         self.cross, self.innovation_cov = nn.Buffer(H @ P), nn.Buffer(H @ P @ H.mT + R)
-        self.eye = nn.Buffer(torch.eye(len(H)).to(H))
         # H m + B a + d as one product with (m, a).
         affine = torch.cat([model.emission_matrix, model.action_matrix], -1)
         self.expectation = nn.Buffer(affine.clone())
@@ -211,8 +207,7 @@ class PolicyStep(nn.Module):
             step = torch.cholesky_solve(H.mT @ (weight.unsqueeze(-1) * residual), factor)
             filtered_cov = torch.cholesky_inverse(factor) if wants_cov else None
         else:
-            both = seen.unsqueeze(-1) & seen.unsqueeze(-2)
-            factor, _ = torch.linalg.cholesky_ex(torch.where(both, S, self.eye))
+            factor, _ = torch.linalg.cholesky_ex(masked_cov(S, seen))
             step = cross.mT @ torch.cholesky_solve(residual, factor)
             if wants_cov:
                 P = _row(self.prior, first) if P is None else P

@@ -102,8 +102,6 @@ class GaussianTransition(nn.Module):
 
     Args:
         state_dim, action_dim: components of the state, of an action.
-
-    Keyword Args:
         hidden_sizes: widths of the hidden layers of f (and of the network Q).
         activation: "relu" or "tanh".
         residual: whether f predicts the change of the mean. With state > obs the directions
@@ -239,8 +237,6 @@ class LinearGaussianEmission(nn.Module):
 
     Args:
         obs_dim, state_dim, action_dim: components of an observation, the state, an action.
-
-    Keyword Args:
         cov: "diag" or "full", the kind of R. A diagonal R opens the information form.
         init_std: standard deviation R starts from, observation units.
         min_std: floor of the standard deviation, observation units.
