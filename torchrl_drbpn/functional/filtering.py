@@ -31,8 +31,8 @@ class FilterOutput(NamedTuple):
 
     Args:
         mean: filtered mean, shape ``(*batch, [time,] state)``.
-        cov: filtered covariance, shape ``(*batch, [time,] state, state)``. Where it is propagated
-            it is always there, without gradient unless asked for; else None where not asked for.
+        cov: filtered covariance, shape ``(*batch, [time,] state, state)``, without gradient unless
+            asked for; None where it is neither propagated nor asked for.
         log_likelihood: of each step, shape ``(*batch, [time])``, nats.
     """
 

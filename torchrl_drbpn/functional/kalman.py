@@ -35,11 +35,8 @@ class MaskModel(NamedTuple):
     .. math:: P(\text{observed}_i \mid x_i) = \Phi(\sqrt{\pi/8}\, (a_i + b_i x_i))
 
     which differs from the logistic :math:`1 / (1 + \exp(-a_i - b_i x_i))` by at most .02
-    (§4.5.2 [Bishop 2006]) and has an average over a Gaussian in closed form.
-
-    Args:
-        intercept: a, shape ``(obs,)``.
-        slope: b, shape ``(obs,)``, one over the units of an observation; 0 is ignorable.
+    (§4.5.2 [Bishop 2006]) and has an average over a Gaussian in closed form. ``intercept`` a and
+    ``slope`` b, one over the units of an observation, are ``(obs,)``; a slope of 0 is ignorable.
     """
 
     intercept: Tensor

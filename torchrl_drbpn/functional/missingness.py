@@ -152,10 +152,8 @@ def outage_rates(eta: float, mean_length: float) -> OutageRates:
     being off (Gilbert, "Capacity of a burst-noise channel", Bell System Technical Journal 1960).
     L = 1 / (1 - eta) has no memory and is MCAR at eta; a shorter one makes a sensor alternate.
 
-    Args:
-        eta: share of the steps that a sensor is off in the long run, in [0, 1).
-        mean_length: L, steps, at least 1 and at least eta / (1 - eta), where P(on -> off) is 1; a
-            ValueError where one of them is out of range.
+    ``eta`` is in [0, 1), ``mean_length`` L, steps, at least 1 and at least eta / (1 - eta), where
+    P(on -> off) is 1; a ValueError where one of them is out of range.
 
     Example:
         >>> outage_rates(0.5, 20).repair, outage_rates(0.5, 20).missing_rate

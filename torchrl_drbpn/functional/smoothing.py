@@ -20,12 +20,7 @@ Jacobian = Tensor | Callable[[Tensor, Tensor], Tensor]
 
 
 class Forecast(NamedTuple):
-    """Hold what is expected of the steps ahead.
-
-    Args:
-        state: beliefs, mean ``(*batch, ahead, state)``, cov ``(*batch, ahead, state, state)``.
-        observation: of the readings, noise included: ``(*batch, ahead, obs)``, ``(..., obs, obs)``.
-    """
+    """Hold beliefs of the steps ahead, ``(*batch, ahead, ...)``, and of their noisy readings."""
 
     state: Belief
     observation: Belief

@@ -294,9 +294,7 @@ class StateSpace:
 
 
 def propagate(jacobian: Tensor, cov: Tensor) -> Tensor:
-    r"""Carry a covariance over a linear map, as a constant of autograd.
-
-    .. math:: F \Sigma F'
+    r"""Carry a covariance over a linear map, :math:`F \Sigma F'`, as a constant of autograd.
 
     float64, symmetric, and no variance over 1e6: rows and columns that would have one are scaled
     down, which leaves a covariance with the same correlations.

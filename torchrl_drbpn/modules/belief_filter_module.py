@@ -46,29 +46,25 @@ class BeliefFilterModule(RecurrentBeliefModule):
             ``("belief", "log_likelihood")`` (the default) and, computed only where asked for,
             ``("belief", "cov")``, ``("belief", "observation")`` (H m + B a + d of the filtered
             mean: every sensor's estimate), ``("belief", "predicted_observation")``,
-            ``("belief", "innovation_cov")`` (float64, as :func:`functional.innovation` has it);
-            or a dict from these names to yours. The recurrent state is always written, under
-            ``("next", ...)``.
+            ``("belief", "innovation_cov")`` (float64); or a dict from these names to yours. The
+            recurrent state is always written, under ``("next", ...)``.
         policy_input: what ``features`` holds, for policy and value to read (eq. 11 [DRBPN]):
             "mean", or "mean_cov" (lower triangle of the filtered covariance behind the mean).
         default_recurrent_mode: the mode outside any ``set_recurrent_mode`` context.
 
     Raises:
         TypeError: if keys are neither a list nor a dict.
-        ValueError: for a key list of another length, an unknown name, a key given twice or an
-            unknown choice.
+        ValueError: for keys that are too few, unknown or given twice, or an unknown choice.
         KeyError: at a call, if an entry is absent; the message says who writes it.
 
     Example:
         >>> from tensordict import TensorDict
         >>> module = BeliefFilterModule(BeliefFilter(obs_dim=5, action_dim=2))
+        >>> state = {"mean": torch.zeros(3, 5), "age": torch.zeros(3, 1).long()}
         >>> data = TensorDict(
-        ...     observation=torch.randn(3, 5), observed=torch.rand(3, 5) < 0.7,
-        ...     previous_action=torch.zeros(3, 2), is_init=torch.ones(3, 1) > 0,
-        ...     recurrent={"mean": torch.zeros(3, 5), "age": torch.zeros(3, 1).long()},
-        ...     batch_size=[3])
-        >>> out = module(data)
-        >>> out["features"].shape, out["next", "recurrent", "age"].flatten().tolist()
+        ...     observation=torch.randn(3, 5), observed=torch.rand(3, 5) < 0.7, recurrent=state,
+        ...     previous_action=torch.zeros(3, 2), is_init=torch.ones(3, 1) > 0, batch_size=[3])
+        >>> module(data)["features"].shape, data["next", "recurrent", "age"].flatten().tolist()
         (torch.Size([3, 5]), [1, 1, 1])
     """
 

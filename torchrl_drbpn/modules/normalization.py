@@ -28,9 +28,9 @@ class MaskedObservationNorm(TensorDictModuleBase):
 
     It is the first module of a policy, ``TensorDictSequential(norm, belief, actor)``: the
     statistics are buffers, so they are saved, exported, compiled and sent to collectors with it.
-    ``forward`` never learns. :meth:`update` learns from a rollout; call it after the epochs on that
-    rollout, since before them the policy would no longer be the one that acted. Until then it is
-    the identity up to ``clip``. Outliers are clipped before they are learned from, see
+    ``forward`` never learns. :meth:`update` does; call it after the epochs on a rollout, since
+    before them the policy would no longer be the one that acted. Until then it is the identity up
+    to ``clip``. Outliers are clipped before they are learned from, see
     :func:`~torchrl_drbpn.functional.running_moments.winsorize`.
 
     Args:
@@ -159,18 +159,12 @@ class MaskedObservationNorm(TensorDictModuleBase):
 
     @torch.no_grad()
     def update(self, tensordict: TensorDictBase) -> None:
-        """Learn from a rollout, every reading that arrived once.
+        """Learn from a rollout ``(*batch, time)``, raw, every reading that arrived once.
 
         The readings of each step, and the next one where an episode or the row ends. The first
         reading of a row that continues an episode (``is_init`` is there and False) is left out: it
-        was counted as the last of the row before.
-
-        Args:
-            tensordict: a rollout of batch size ``(*batch, time)``, raw observations; without
-                "next" its steps alone count.
-
-        Raises:
-            ValueError: for a shape that does not fit, and for a reading that is NaN or infinite.
+        was counted as the last of the row before. Without "next" the steps alone count. A
+        ValueError for a shape that does not fit, and for a reading that is NaN or infinite.
         """
         if not tensordict.ndim:
             raise ValueError("`tensordict` must be a rollout of batch size (*batch, time), got ().")
