@@ -25,7 +25,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from tqdm import tqdm
-from training.agent import add_primers, make_agent, start_from_pretrained
+from training.agent import add_primers, device_named, make_agent, start_from_pretrained
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint, save_checkpoint
 from training.config import build, checked, explained, one_line, run_command
 from training.console import BAR, StopRequest, say, show, stop_request
@@ -49,16 +49,17 @@ from torchrl_drbpn import BeliefDivergedError
 
 def assemble(config: DictConfig) -> Training:
     """Build everything a run needs; weights and actions come from torch's global generator."""
+    device = device_named(config.get("device", "cpu"))
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     env = make_env(config)
-    agent = make_agent(config, env)
+    agent = make_agent(config, env).to(device)
     if config.resume is None:
         start_from_pretrained(agent)
     add_primers(env, agent)
     loss = build("loss", config.loss, agent)
     steps = build("optim", config.optim, agent.parameters())
-    gae = build("advantage", config.advantage)
+    gae = build("advantage", config.advantage).to(device)
     gae.set_keys(reward="scaled_reward")
     made: Any = partial(make_env, config)
     learned: Any = {"loss": loss, "steps": steps, "gae": gae, "seed": config.seed}

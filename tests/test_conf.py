@@ -177,8 +177,8 @@ def test_resume_takes_the_settings_of_its_folder_and_only_the_allowed_overrides(
 @pytest.mark.parametrize(
     ("word", "line"),
     [
-        ("seed=1", "only total_frames, logger, evaluation .*seed=1"),
-        ("env=hopper", "only total_frames, logger, evaluation .*env=hopper"),
+        ("seed=1", "only total_frames, device, logger, evaluation .*seed=1"),
+        ("env=hopper", "only total_frames, device, logger, evaluation .*env=hopper"),
         ("hydra.run.dir=there", "`resume` names the run folder already; .*hydra.run.dir=there"),
     ],
 )

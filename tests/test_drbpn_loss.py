@@ -401,3 +401,14 @@ def test_functional_or_not_gives_the_same_terms_and_gradients(model_coeff):
     outs = [make_loss(agent, ppo={"functional": f}, **options)(data) for f in (True, False)]
     assert_identical(*outs)
     assert all(map(torch.equal, *(gradients(agent, summed(out)) for out in outs)))
+
+
+@filters
+def test_every_tensor_is_made_on_the_device_of_the_input(covariance, monkeypatch):
+    # "meta" refuses to be mixed with "cpu" as a GPU does; it has no numbers to choose steps by, so
+    # all are taken, as in a compiled loss. TorchRL's functional parameters can't be moved there.
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    options = {"functional": False, "entropy_bonus": False}  # its entropy is looked at
+    loss = make_loss(make_belief_agent(torch.float64, covariance), ppo=options)
+    out = loss.to("meta")(make_data(torch.float64, covariance).to("meta"))
+    assert {value.device.type for value in out.values(True, True)} == {"meta"}

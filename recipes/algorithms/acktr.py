@@ -77,7 +77,8 @@ class ACKTR:
         for _ in range(self.critic_steps):
             with self.critic.recording():
                 value = self.agent.critic(inputs.copy()).get("state_value")
-            self.critic.observe(value, torch.randn(value.shape, generator=self.generator))
+            noise = torch.randn(value.shape, generator=self.generator)
+            self.critic.observe(value, noise.to(value.device))
             loss = (value - target).square().mean() / 2
             self.critic.zero_grad()
             torch.autograd.backward(loss)
@@ -92,7 +93,7 @@ class ACKTR:
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         with self.policy.recording():
             dist = actor.get_dist(inputs.copy())
-        noise = torch.randn(dist.mean.shape, generator=self.generator)
+        noise = torch.randn(dist.mean.shape, generator=self.generator).to(dist.mean.device)
         self.policy.observe(dist.mean, noise / dist.stddev.detach())
         loss = -(advantage * dist.log_prob(frames.get("action"))).mean()
         self.policy.zero_grad()

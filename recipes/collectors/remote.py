@@ -51,6 +51,8 @@ class RayRollouts:
                 f"`collector.workers` must divide `collector.num_envs`, got {workers} and "
                 f"{num_envs}."
             )
+        if next(policy.parameters()).device.type != "cpu":
+            raise UserError("`collector=ray` needs device=cpu: its workers run the policy there.")
         self._ray = _connect(address, workers * cpus_per_worker)
         self._policy, self._make_env, self._cpus = policy, make_env, cpus_per_worker
         self._num_envs, self._steps, self._workers = num_envs, steps_per_env, workers

@@ -1,5 +1,6 @@
 """An agent that a run has trained, read from its folder: the only place that builds one anew."""
 
+import copy
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -159,12 +160,15 @@ def _read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], int]:
 def evaluate_training(
     config: DictConfig, training: Training, kind: str, episodes: int, stop: Callable[[], bool]
 ) -> list[dict[str, Any]] | None:
-    """Evaluate the agent of a run: a row for each kind of action, None if ``stop`` ended it."""
+    """Evaluate the agent of a run on the CPU: a row for each mode, None if ``stop`` ended it."""
     make_env = TrainedAgent(config, training.agent, training.frames).environments()
+    policy = training.agent.policy
+    if next(policy.parameters()).device.type != "cpu":
+        policy = copy.deepcopy(policy).cpu()
     how: Any = {"episodes": episodes, "seed": config.evaluation.seed, "stop": stop}
     rows = []
     for mode in config.evaluation.modes:
-        result = evaluate(training.agent.policy, make_env, mode=mode, **how)
+        result = evaluate(policy, make_env, mode=mode, **how)
         if result is None:
             return None
         result = result.assign(frames=training.frames, kind=kind, mode=mode)

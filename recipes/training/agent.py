@@ -92,6 +92,20 @@ class Agent(nn.Module):
         return value if where is not None else value.reshape(*tensordict.shape, 1)
 
 
+def device_named(name: str) -> torch.device:
+    """Return the device that a setting names, if it is here."""
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError):
+        device = torch.device("meta")
+    if device.type not in ("cpu", "cuda"):
+        raise UserError(f"`device` must be cpu, cuda or cuda and a number, cuda:1, got {name!r}.")
+    count = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise UserError(f"`device={name}` is not here: torch finds {count} CUDA devices.")
+    return device
+
+
 def make_agent(config: DictConfig, env: TransformedEnv) -> Agent:
     """Build an agent, with weights from torch's global generator."""
     obs_dim = env.observation_spec["observation"].shape[-1]

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
+import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -241,6 +242,10 @@ def make_collector(
     num_envs: int,
     steps_per_env: int,
 ) -> Collector:
-    """Make TorchRL's collector of one rollout after the other."""
-    frames = num_envs * steps_per_env
-    return Collector(env, policy, frames_per_batch=frames, total_frames=-1, **COLLECTING)
+    """Make TorchRL's collector of one rollout after the other, kept where the policy is."""
+    frames, device = num_envs * steps_per_env, next(policy.parameters()).device
+    places: dict[str, Any] = {}
+    if device.type != "cpu":
+        places = {"policy_device": device, "storing_device": device}
+        places["env_device"] = env.device or torch.device("cpu")
+    return Collector(env, policy, frames_per_batch=frames, total_frames=-1, **places, **COLLECTING)

@@ -71,7 +71,7 @@ def to_sequences(data: TensorDictBase, loss: LossModule, length: int) -> TensorD
     observation after it is nobody's root step and its likelihood is counted here. Where sequences
     are cut from each other nothing is marked.
     """
-    final = torch.zeros(*data.shape, 1, dtype=torch.bool)
+    final = torch.zeros_like(data.get(("next", "done")))
     final[:, -1] = True
     kept = data.select(*loss.in_keys, *_ESTIMATES, strict=False).set("final", final)
     return kept.reshape(-1, length).contiguous()

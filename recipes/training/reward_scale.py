@@ -55,7 +55,7 @@ def scale_reward(
         discounted = gamma * discounted + r
         returns.append(discounted)
         discounted = torch.where(over, 0.0, discounted)
-    before = RunningMoments(statistics.n, statistics.mean, statistics.var)
+    before = RunningMoments(*(part.to(reward.device) for part in statistics[:3]))
     after = merge_moments(before, masked_moments(torch.cat(returns)))
     scaled = (reward / spread(after, eps)).clamp(-clip, clip)
     return scaled.to(reward.dtype), ReturnStatistics(*after, discounted)

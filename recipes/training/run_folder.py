@@ -26,7 +26,7 @@ _PACKAGES = (
     *("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "envpool", "numpy", "hydra-core"),
     "torchrl_drbpn",
 )
-MAY_CHANGE = ("total_frames", "logger", "evaluation")  # with resume=
+MAY_CHANGE = ("total_frames", "device", "logger", "evaluation")  # with resume=
 # Of evaluation.csv: one row an evaluation and kind of action.
 EVALUATION_COLUMNS = (
     *("frames", "kind", "mode", "episodes", "return_mean", "return_std", "length_mean"),
