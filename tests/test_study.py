@@ -204,6 +204,37 @@ def test_what_fails_ends_no_other_and_launchers_run_the_same_cells_to_the_same_b
         assert not differences(first, load_checkpoint(last_checkpoint(folder)))
 
 
+def test_slurm_gets_one_array_with_a_task_for_each_cell(tmp_path):
+    """A dry run: `sbatch` keeps what it is given, and `sacct` says that every task failed."""
+    fake, sweep = tmp_path / "bin", tmp_path / "sweep"
+    fake.mkdir()
+    scripts = {
+        "sbatch": f'cp "$1" {tmp_path}/submitted.sh; echo "Submitted batch job 42"',
+        "srun": "exit 1",
+        "sacct": "echo 'JobID|State|NodeList'; printf '42_%s|FAILED|\\n' 0 1 2",
+    }
+    for name, line in scripts.items():
+        (fake / name).write_text(f"#!/bin/sh\n{line}\n")
+        (fake / name).chmod(0o755)
+    done = command(
+        "recipes/ppo_drbpn.py", "--multirun", "experiment=smoke", "seed=0,1,2",
+        f"hydra.sweep.dir={sweep}", "hydra/launcher=submitit_slurm",
+        "hydra.launcher.partition=cpu", "hydra.launcher.timeout_min=90",
+        "hydra.launcher.cpus_per_task=2", "hydra.launcher.array_parallelism=2",
+        cwd=tmp_path, PATH=f"{fake}:{os.environ['PATH']}",
+    )  # fmt: skip
+    assert done.returncode
+    lines = (tmp_path / "submitted.sh").read_text().splitlines()
+    wanted = {"array=0-2%2", "partition=cpu", "time=90", "cpus-per-task=2", "job-name=ppo_drbpn"}
+    assert {f"#SBATCH --{flag}" for flag in wanted} <= set(lines)
+    (run,) = [line for line in lines if line.startswith("srun ")]
+    assert f"{sys.executable} -u -m submitit.core._submit {sweep}/.submitit/" in run
+    cells = sorted(sweep.glob(".submitit/42_*/42_*_submitted.pkl"))
+    assert len(cells) == 3
+    for seed, cell in enumerate(cells):
+        assert f"seed={seed}".encode() in cell.read_bytes()
+
+
 @pytest.fixture
 def start(tmp_path):
     """Start a sweep in a process group of its own; nothing of it is left at the end."""
