@@ -72,7 +72,9 @@ def test_a_recording_is_the_first_episode_of_an_evaluation(drbpn, tmp_path):
     np.testing.assert_array_equal(later.estimate, whole.estimate[2:5])
 
 
-def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(drbpn, recording):
+def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(
+    drbpn, recording, tmp_path, capsys
+):
     assert 0 < recording.missing_ratio < 1
     assert (recording.arrived[~recording.observed] == 0).all()
     clean = record(drbpn, "noise:0")
@@ -83,6 +85,8 @@ def test_what_arrived_is_the_truth_and_some_noise_and_what_did_not_is_zero(drbpn
     assert np.isnan(record(drbpn, "none:0").coverage)
     removed = ~record(drbpn, "reduction:0.5:random").observed.any(0)
     assert removed.sum() == 2
+    assert show(drbpn, tmp_path / "belief.png", point="reduction:0.5:random") == 0
+    assert "missing 0.50" in capsys.readouterr().out
 
 
 def test_coverage_counts_the_missing_entries_inside_their_interval(recording):
