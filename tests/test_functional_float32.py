@@ -169,6 +169,23 @@ def test_float32_covariances_survive_10000_iterations(state, obs, predicts):
     assert not len(bad), f"indefinite in {len(bad)} of 10,000 iterations, first at {int(bad[0])}"
 
 
+@pytest.mark.parametrize("dead", [False, True], ids=["random masks", "a sensor dead for good"])
+@pytest.mark.parametrize(("state", "obs"), [(17, 17), (32, 8)], ids=str)
+def test_float32_updates_of_a_correlated_belief_stay_positive_definite(state, obs, dead):
+    g = torch.Generator().manual_seed(0)
+    root = torch.randn(state, state, generator=g)
+    belief = Belief(torch.zeros(state), root @ root.T / state + 0.01 * torch.eye(state))
+    h, r = torch.randn(obs, state, generator=g) / state**0.5, 1e-4 * torch.eye(obs)
+    observed = torch.arange(obs) > 0
+    covs = []
+    for _ in range(1500):
+        if not dead:
+            observed = torch.rand(obs, generator=g) < 0.5
+        belief = F.update(belief, torch.randn(obs, generator=g), observed, h, r)
+        covs.append(belief.cov)
+    assert smallest_eigenvalues(torch.stack(covs)).min() > 0
+
+
 @pytest.mark.parametrize("std", [0.3, 3.0])
 def test_a_float32_covariance_is_not_inflated(std):
     # A large prior beside a small R: the safeguard against rounding must not show.
