@@ -1,11 +1,8 @@
 """Frames for belief modules, and the two ways to run over them; see contracts.py."""
 
-from typing import Any
-
 import torch
 from contract_environments import ACTION, OBS
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDict
 from torchrl.envs import Compose
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.utils import get_primers_from_module
@@ -27,16 +24,10 @@ class BeliefFrames:
     tolerance64: float = 1e-10
 
     @property
-    def frame_keys(self) -> tuple[str, ...]:
+    def frame_keys(self):
         return (self.observation, "observed", "previous_action", "is_init")
 
-    def make_frames(
-        self,
-        shape: tuple[int, ...],
-        dtype: torch.dtype = torch.float32,
-        seed: int = 0,
-        obs: int = OBS,
-    ) -> TensorDict:
+    def make_frames(self, shape, dtype=torch.float32, seed=0, obs=OBS):
         """Return what the environment writes, nowhere an episode start."""
         g = torch.Generator().manual_seed(seed)
         observed = torch.rand(*shape, obs, generator=g) < 0.6
@@ -51,22 +42,20 @@ class BeliefFrames:
             shape,
         )
 
-    def any_module(self) -> TensorDictModuleBase:
+    def any_module(self):
         """Return the module under test."""
         raise NotImplementedError(f"{type(self).__name__} must say in `any_module` what is tested")
 
-    def primers(self, module: TensorDictModuleBase) -> dict[Any, Any]:
+    def primers(self, module):
         """Return the specs of the recurrent state; none where the module has no memory."""
         found = get_primers_from_module(module, warn=False)
         parts = [] if found is None else found if isinstance(found, Compose) else [found]
         return {key: spec for part in parts for key, spec in part.primers.items(True, True)}
 
-    def state_keys(self, module: TensorDictModuleBase) -> list[Any]:
+    def state_keys(self, module):
         return list(self.primers(module))
 
-    def some_state(
-        self, module: TensorDictModuleBase, shape: tuple[int, ...], seed: int = 1
-    ) -> TensorDict:
+    def some_state(self, module, shape, seed=1):
         """Return a recurrent state in mid-episode: what the module wrote after two steps."""
         dtype = next(module.parameters()).dtype
         frames = self.make_frames((*shape, 2), dtype, seed)
@@ -76,9 +65,7 @@ class BeliefFrames:
                 *self.state_keys(module)
             )
 
-    def one_by_one(
-        self, module: TensorDictModuleBase, frames: TensorDict, start: TensorDict | None
-    ) -> TensorDict:
+    def one_by_one(self, module, frames, start):
         """Run step by step as a collector does; the primer's zeros where an episode starts.
 
         The result holds the stored state at every step, as a collected rollout does.
@@ -100,17 +87,15 @@ class BeliefFrames:
             steps.append(step)
         return torch.stack(steps, len(batch))
 
-    def as_sequence(self, module: TensorDictModuleBase, rollout: TensorDict) -> TensorDict:
+    def as_sequence(self, module, rollout):
         """Run over time from what a rollout stores, with what the module wrote left out."""
         with set_recurrent_mode(True):
             return module(rollout.select(*self.frame_keys, *self.state_keys(module)))
 
-    def written(self, module: TensorDictModuleBase) -> list[Any]:
+    def written(self, module):
         return [k for k in module.out_keys if not (isinstance(k, tuple) and k[0] == "next")]
 
-    def assert_same(
-        self, module: TensorDictModuleBase, received: TensorDictBase, expected: TensorDictBase
-    ) -> None:
+    def assert_same(self, module, received, expected):
         for key in self.written(module):
             dtype = expected[key].dtype
             limit = self.tolerance64 if dtype == torch.float64 else self.tolerance32

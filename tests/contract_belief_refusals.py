@@ -1,12 +1,9 @@
 """What every belief module refuses, by name; see contracts.py."""
 
-from typing import Any
-
 import pytest
 import torch
 from belief_frames import BeliefFrames
 from contract_environments import ACTION, OBS
-from tensordict.nn import TensorDictModuleBase
 from torchrl.modules import set_recurrent_mode
 
 
@@ -14,13 +11,11 @@ class BeliefModuleRefusals(BeliefFrames):
     """Keys, entries and readings that a belief module can not use."""
 
     # --- hook
-    def make_module(
-        self, obs: int = OBS, action: int = ACTION, dtype: torch.dtype | None = None, **kwargs: Any
-    ) -> TensorDictModuleBase:
+    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
         """Return a module, equal to every other made with the same arguments."""
         raise NotImplementedError(f"{type(self).__name__} must say in `make_module` what is tested")
 
-    def any_module(self) -> TensorDictModuleBase:
+    def any_module(self):
         return self.make_module()
 
     # --- tests

@@ -17,8 +17,7 @@ from contract_environments import (
     saved,
     with_belief_entries,
 )
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs import (
     Compose,
@@ -48,7 +47,7 @@ class BeliefModuleContract(BeliefModuleRefusals):
     all_outputs: Any = None
 
     # --- hooks
-    def differentiable(self, out: TensorDictBase) -> torch.Tensor:
+    def differentiable(self, out):
         """Return a number that depends on everything the module learns from."""
         return out["features"].square().mean()
 
@@ -80,7 +79,7 @@ class BeliefModuleContract(BeliefModuleRefusals):
             expected = module(data.clone())
             self.assert_same(module, without(data.select(*without.in_keys)), expected)
 
-    def by_name(self, module: TensorDictModuleBase, step: TensorDictBase) -> dict[str, Any]:
+    def by_name(self, module, step):
         return {k if isinstance(k, str) else "_".join(k): step[k] for k in module.in_keys}
 
     def test_dispatch_takes_tensors_by_name(self):
@@ -224,7 +223,7 @@ class BeliefModuleContract(BeliefModuleRefusals):
         assert data["next", "done"].any()
         self.check_collected(module, data)
 
-    def check_collected(self, module: TensorDictModuleBase, data: TensorDictBase) -> None:
+    def check_collected(self, module, data):
         """Assert that a rollout's beliefs are those of its frames, run over time."""
         age = torch.zeros_like(data[self.age_key][..., 0, :])
         for t in range(data.shape[-1]):
@@ -235,7 +234,7 @@ class BeliefModuleContract(BeliefModuleRefusals):
             age = age + 1
         self.assert_same(module, self.as_sequence(module, data), data)
 
-    def make_policy(self, module: TensorDictModuleBase, actions: int) -> TensorDictSequential:
+    def make_policy(self, module, actions):
         head = TensorDictModule(nn.LazyLinear(actions), ["features"], ["action"])
         return TensorDictSequential(module, head)
 

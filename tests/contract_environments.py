@@ -1,10 +1,9 @@
 """Environments and helpers that the contracts share; see contracts.py."""
 
 import io
-from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import (
     Compose,
@@ -14,7 +13,6 @@ from torchrl.envs import (
     GymEnv,
     InitTracker,
     ParallelEnv,
-    Transform,
     TransformedEnv,
 )
 
@@ -30,9 +28,7 @@ class StaircaseEnv(EnvBase):
     times. The reward is 1 a step. Actions change nothing.
     """
 
-    def __init__(
-        self, batch: int = 3, horizon: int = 3, obs: int = OBS, dtype: torch.dtype = torch.float32
-    ) -> None:
+    def __init__(self, batch=3, horizon=3, obs=OBS, dtype=torch.float32):
         super().__init__(batch_size=[batch], device="cpu")
         shape = (batch,)
         self.observation_spec = Composite(
@@ -46,13 +42,13 @@ class StaircaseEnv(EnvBase):
         self.time = torch.zeros(batch, dtype=torch.int64)
         self.ramp = torch.arange(obs, dtype=dtype) / 10 + 100.0 * torch.arange(batch)[:, None]
 
-    def _observe(self) -> TensorDict:
+    def _observe(self):
         observation = (self.ramp + self.time[:, None]).to(self.ramp.dtype)
         done = (self.time >= self.last)[:, None]
         entries = {"observation": observation, "done": done, "terminated": done.clone()}
         return TensorDict(entries, self.batch_size)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+    def _reset(self, tensordict=None, **kwargs):
         del kwargs
         rows = None if tensordict is None else tensordict.get("_reset", None)
         if rows is None:
@@ -61,31 +57,31 @@ class StaircaseEnv(EnvBase):
             self.time = self.time.masked_fill(rows.reshape(-1), 0)
         return self._observe()
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def _step(self, tensordict):
         del tensordict
         self.time = self.time + 1
         return self._observe().set("reward", torch.ones(*self.batch_size, 1))
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed):
         del seed
 
 
-def gym_env(name: str = "InvertedPendulum-v5") -> EnvBase:
+def gym_env(name="InvertedPendulum-v5"):
     """Return a Gymnasium environment in float32, one process, batch size ()."""
     return TransformedEnv(GymEnv(name), DoubleToFloat())
 
 
-def parallel_env(workers: int, factory: Any) -> ParallelEnv:
+def parallel_env(workers, factory):
     """Return a ParallelEnv whose processes start quickly; `factory` must be picklable."""
     return ParallelEnv(workers, factory, mp_start_method="fork")
 
 
-def with_transform(make_env: Any, make_transform: Any) -> EnvBase:
+def with_transform(make_env, make_transform):
     """Return `make_env()` with `make_transform()` appended."""
     return make_env().append_transform(make_transform())
 
 
-def saved(state: Any) -> Any:
+def saved(state):
     """Return `state` after a trip through a file that is read without running code."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
@@ -93,30 +89,28 @@ def saved(state: Any) -> Any:
     return torch.load(buffer, weights_only=True)
 
 
-def staircase(*transforms: Any, **kwargs: Any) -> TransformedEnv:
+def staircase(*transforms, **kwargs):
     """Return a staircase with transforms."""
     return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
 
 
-def vectors(value: float = 1.0, batch: tuple[int, ...] = (4,), **more: Any) -> TensorDict:
+def vectors(value=1.0, batch=(4,), **more):
     """Return observations of one value, as a step would give them."""
     return TensorDict({"observation": torch.full((*batch, OBS), value), **more}, batch)
 
 
-def belief_env(primer: Transform | None = None, name: str = "InvertedPendulum-v5") -> EnvBase:
+def belief_env(primer=None, name="InvertedPendulum-v5"):
     """Return an environment that writes what every belief module reads, batch size ()."""
     env = TransformedEnv(GymEnv(name), Compose())
     return with_belief_entries(env, primer)
 
 
-def actions_in_float64() -> Transform:
+def actions_in_float64():
     """Return the transform that lets a float64 policy act in a simulator of float32 actions."""
     return DTypeCastTransform(torch.float32, torch.float64, in_keys=[], in_keys_inv=["action"])
 
 
-def with_belief_entries(
-    env: TransformedEnv, primer: Transform | None = None, *, to_float32: bool = True
-) -> TransformedEnv:
+def with_belief_entries(env, primer=None, *, to_float32=True):
     """Append what every belief module reads; half of the entries are missing.
 
     In float64 the actions are float64 too, as the policy's are.

@@ -1,13 +1,10 @@
 """Duties of every loss; see contracts.py."""
 
 import copy
-from typing import Any
 
 import pytest
 import torch
 from contract_environments import saved
-from tensordict import TensorDict, TensorDictBase
-from torchrl.objectives.common import LossModule
 
 
 class LossContract:
@@ -23,23 +20,23 @@ class LossContract:
     reductions: tuple[str, ...] = ()
 
     # --- hooks
-    def make_loss(self, **kwargs: Any) -> LossModule:
+    def make_loss(self, **kwargs):
         """Return a loss, equal to every other that this method returns."""
         raise NotImplementedError(f"{type(self).__name__} must say in `make_loss` what is tested")
 
-    def make_loss_data(self, dtype: torch.dtype = torch.float32) -> TensorDict:
+    def make_loss_data(self, dtype=torch.float32):
         """Return a minibatch, `[batch, time]`."""
         raise NotImplementedError(
             f"{type(self).__name__} must say in `make_loss_data` what is read"
         )
 
     # --- helpers
-    def _total(self, out: TensorDictBase) -> torch.Tensor:
+    def _total(self, out):
         terms = [v for k, v in out.items() if isinstance(k, str) and k.startswith("loss")]
         assert terms
         return torch.stack([term.sum() for term in terms]).sum()
 
-    def _assert_equal(self, received: TensorDictBase, expected: TensorDictBase) -> None:
+    def _assert_equal(self, received, expected):
         assert set(received.keys(True, True)) == set(expected.keys(True, True))
         for key in expected.keys(True, True):
             torch.testing.assert_close(received[key], expected[key])

@@ -1,17 +1,12 @@
 """Duties of every belief module of a recipe; see contracts.py."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import pytest
 import small_agents
 import torch
 from belief_frames import BeliefFrames
 from contract_environments import ACTION, OBS, StaircaseEnv
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -24,9 +19,6 @@ from torchrl_drbpn import (
     PreviousAction,
 )
 from torchrl_drbpn.modules import MaskedObservationNorm
-
-if TYPE_CHECKING:
-    from beliefs import Belief
 
 LOG_LIKELIHOOD = ("belief", "log_likelihood")
 
@@ -42,29 +34,29 @@ class RecipeBeliefContract(BeliefFrames):
     observation = "normalized_observation"
 
     # --- hooks
-    def make_belief(self, obs: int = OBS, action: int = ACTION) -> Belief:
+    def make_belief(self, obs=OBS, action=ACTION):
         """Return a belief in float32, equal to every other made with the same arguments."""
         raise NotImplementedError(f"{type(self).__name__} must say in `make_belief` what is tested")
 
     # --- helpers
-    def any_module(self) -> TensorDictModuleBase:
+    def any_module(self):
         return self.make_belief().module
 
-    def frames(self, time: int = 6) -> TensorDict:
+    def frames(self, time=6):
         """Return three rows that begin an episode; one of them begins another."""
         frames = self.make_frames((3, time))
         frames["is_init"][:, 0] = True
         frames["is_init"][1, time // 2] = True
         return frames
 
-    def sequence(self, belief: Belief, frames: TensorDict) -> TensorDict:
+    def sequence(self, belief, frames):
         """Run over time from what a collector that saw the same frames would have stored."""
         with torch.no_grad():
             stored = self.one_by_one(belief.module, frames.detach(), None)
         states = stored.select(*self.state_keys(belief.module))
         return self.as_sequence(belief.module, frames.copy().update(states))
 
-    def learned_belief(self) -> Belief:
+    def learned_belief(self):
         """Return a belief away from where it starts: some start with layers of zeros."""
         belief = self.make_belief()
         g = torch.Generator().manual_seed(0)
@@ -73,7 +65,7 @@ class RecipeBeliefContract(BeliefFrames):
                 parameter += 0.05 * torch.randn(parameter.shape, generator=g)
         return belief
 
-    def make_env(self) -> TransformedEnv:
+    def make_env(self):
         """Return four rows dressed as the recipe does, two that terminate, one that is cut off."""
         transforms = (
             PreviousAction(),
@@ -84,7 +76,7 @@ class RecipeBeliefContract(BeliefFrames):
         )
         return TransformedEnv(StaircaseEnv(4), Compose(*transforms))
 
-    def collected(self, belief: Belief) -> tuple[small_agents.Agent, TensorDictBase]:
+    def collected(self, belief):
         """Return heads and a rollout whose rows begin in mid-episode, with ends of both kinds."""
         norm = MaskedObservationNorm(OBS)
         norm.update(self.make_env().rollout(40, break_when_any_done=False))

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from typing import Any
 
 import oracles
 import pytest
@@ -10,9 +9,8 @@ import torch
 from small_agents import make_filter
 from torch import Tensor
 
-from torchrl_drbpn import BeliefFilter, GaussianTransition, LinearGaussianEmission
+from torchrl_drbpn import GaussianTransition, LinearGaussianEmission
 from torchrl_drbpn.functional import (
-    FilterOutput,
     StateSpace,
     TransitionMLP,
     filter_sequence,
@@ -38,18 +36,16 @@ FORMS = [
 TOLERANCE = 1e-10
 
 
-def assert_equal(actual: Tensor, expected: Tensor, tolerance: float = TOLERANCE) -> None:
+def assert_equal(actual, expected, tolerance=TOLERANCE):
     torch.testing.assert_close(actual, expected, atol=tolerance, rtol=tolerance)
 
 
-def outputs(*step: Any) -> tuple[Tensor, ...]:
+def outputs(*step):
     """Residual and innovation covariance, filtered mean and covariance, log-likelihood."""
     return (*innovation(*step), *update(*step), log_likelihood(*step))
 
 
-def make_model(
-    kind: str, dtype: torch.dtype = torch.float64, obs: int = 5, action: int = 2, **options: Any
-) -> BeliefFilter:
+def make_model(kind, dtype=torch.float64, obs=5, action=2, **options):
     """A filter of fixed parameters, all away from their starting values."""
     state = {"information": 3, "free": 7, "network": 3}.get(kind, obs)
     place = {"cov": "full", "dtype": dtype}
@@ -64,16 +60,7 @@ def make_model(
     return make_filter(obs, action, dtype, state, cov_network=kind == "network", **options)
 
 
-def by_hand(
-    model: BeliefFilter,
-    mean: Tensor,
-    cov: Tensor | None,
-    previous_action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    **options: Any,
-) -> oracles.Sequence:
+def by_hand(model, mean, cov, previous_action, observation, observed, reset, **options):
     """The oracle with a filter's own transition and emission."""
     emission, propagated = model.emission, model.covariance == "propagated"
     given = {
@@ -109,22 +96,22 @@ class Problem:
 
     def __init__(
         self,
-        state: int,
-        obs: int,
+        state,
+        obs,
         *,
-        batch: int = 3,
-        time: int = 6,
-        seed: int = 0,
-        full_noise: bool = False,
-        resets: bool = True,
-        stored: bool = False,
-        weighted: bool = False,
-        hidden: tuple[int, ...] = (5,),
-        residual: bool = True,
-        activation: str = "tanh",
-        dtype: torch.dtype = torch.float64,
-        propagated: bool = False,
-    ) -> None:
+        batch=3,
+        time=6,
+        seed=0,
+        full_noise=False,
+        resets=True,
+        stored=False,
+        weighted=False,
+        hidden=(5,),
+        residual=True,
+        activation="tanh",
+        dtype=torch.float64,
+        propagated=False,
+    ):
         system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
         data = oracles.simulate(system, batch, time, seed=seed, reset_rate=0.3 if resets else 0.0)
         g = torch.Generator().manual_seed(seed + 9)
@@ -171,18 +158,18 @@ class Problem:
         self.layers = len(widths) - 1
         self.leaves = {k: v.to(dtype).clone().requires_grad_() for k, v in leaves.items()}
 
-    def network(self) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    def network(self):
         return (
             tuple(self.leaves[f"weight{i}"] for i in range(self.layers)),
             tuple(self.leaves[f"bias{i}"] for i in range(self.layers)),
         )
 
-    def covs(self) -> tuple[Tensor, Tensor, Tensor]:
+    def covs(self):
         q, p = self.leaves["transition_root"], self.leaves["initial_root"]
         r = self.leaves["noise"]
         return q @ q.mT, p @ p.mT, r @ r.mT if self.full_noise else r
 
-    def model(self, step_by_step: bool = False) -> StateSpace:
+    def model(self, step_by_step=False):
         q, p, r = self.covs()
         return StateSpace(
             transition=TransitionMLP(*self.network(), self.residual, self.activation),
@@ -196,24 +183,22 @@ class Problem:
             transition_jacobian=self.jacobian,
         )
 
-    def arguments(self) -> tuple[Tensor, ...]:
+    def arguments(self):
         named = (self.leaves[k] for k in ("start_mean", "previous_action", "observation"))
         return (*named, self.observed, self.reset)
 
-    def stored(self) -> dict[str, Any]:
+    def stored(self):
         names = {"stored_mean": self.leaves.get("stored_mean"), "stored_cov": self.stored_cov}
         return {"use_stored_state": self.use_stored, **names}
 
-    def operator_arguments(self) -> list[Any]:
+    def operator_arguments(self):
         """Return what the native operator takes."""
         mean, action, x, seen, reset = self.arguments()
         use, stored, stored_cov = self.stored().values()
         belief = (use, stored, mean, stored_cov, self.start_cov)
         return [x, seen, action, reset, *belief, *native.operator_arguments(self.model())]
 
-    def run(
-        self, form: str, *arguments: Tensor, function: Any = filter_sequence, **kwargs: Any
-    ) -> FilterOutput:
+    def run(self, form, *arguments, function=filter_sequence, **kwargs):
         """Filter by one form; "step by step" is what a Q that depends on the state takes."""
         by_step = form == "step by step"
         if self.jacobian is not None:
@@ -225,10 +210,10 @@ class Problem:
             **kwargs,
         )
 
-    def library(self, form: str) -> FilterOutput:
+    def library(self, form):
         return self.run(form, **self.stored(), weight=self.weight, return_cov=True)
 
-    def oracle(self) -> tuple[Tensor, Tensor, Tensor]:
+    def oracle(self):
         q, p, r = self.covs()
         noise, observed = r if self.full_noise else torch.diag(r), self.observed
         if self.weight is not None:
@@ -255,7 +240,7 @@ class Problem:
         )
         return out.mean, out.cov, out.log_likelihood
 
-    def gradients(self, outputs: tuple[Tensor, ...]) -> dict[str, Tensor]:
+    def gradients(self, outputs):
         """Differentiate one fixed random function of all the outputs by every leaf."""
         g = torch.Generator().manual_seed(3)
         loss = torch.zeros((), dtype=outputs[0].dtype)
@@ -271,12 +256,7 @@ class Problem:
         }
 
 
-def assert_same(
-    problem: Problem,
-    actual: tuple[Tensor, ...],
-    expected: tuple[Tensor, ...],
-    tolerance: float = TOLERANCE,
-) -> None:
+def assert_same(problem, actual, expected, tolerance=TOLERANCE):
     for name, a, e in zip(("mean", "cov", "log_likelihood"), actual, expected, strict=True):
         torch.testing.assert_close(
             a, e, atol=tolerance, rtol=tolerance, msg=lambda m, n=name: f"{n}: {m}"

@@ -8,12 +8,9 @@ Symbols: m, P are the mean and covariance of a belief, H, R, B, d the emission o
 x = H s + B a + d + noise, Q the transition covariance, rows the indices of the observed entries.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,27 +18,14 @@ from torch import Tensor
 Transition = Callable[[Tensor, Tensor], Tensor]
 
 
-def predict(
-    mean: Tensor,
-    cov: Tensor,
-    transition: Transition,
-    transition_cov: Tensor,
-    action: Tensor,
-    jacobian: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+def predict(mean, cov, transition, transition_cov, action, jacobian=None):
     """Eq. (8): m = f(m, a), P = Q; or P = J P J' + Q where a Jacobian is given."""
     if jacobian is None:
         return transition(mean, action), transition_cov
     return transition(mean, action), jacobian @ cov @ jacobian.T + transition_cov
 
 
-def observed_rows(
-    observation: Tensor,
-    observed: Tensor,
-    matrix: Tensor,
-    noise: Tensor,
-    offset: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+def observed_rows(observation, observed, matrix, noise, offset=None):
     """What arrived less its offset, and the rows of H and R that belong to it."""
     rows = observed.nonzero().squeeze(-1)
     x = observation[rows]
@@ -50,7 +34,7 @@ def observed_rows(
     return x, matrix[rows], noise[rows][:, rows]
 
 
-def update(mean: Tensor, cov: Tensor, *step: Tensor | None) -> tuple[Tensor, Tensor]:
+def update(mean, cov, *step):
     """Eq. (10) on the observed rows alone; `step` is what `observed_rows` takes."""
     x, h, r = observed_rows(*step)
     if x.numel() == 0:
@@ -60,7 +44,7 @@ def update(mean: Tensor, cov: Tensor, *step: Tensor | None) -> tuple[Tensor, Ten
     return mean + gain @ (x - h @ mean), cov - gain @ h @ cov
 
 
-def log_likelihood(mean: Tensor, cov: Tensor, *step: Tensor | None) -> Tensor:
+def log_likelihood(mean, cov, *step):
     """Eq. (12): the log density of the observed entries under the predicted belief."""
     x, h, r = observed_rows(*step)
     if x.numel() == 0:
@@ -82,25 +66,25 @@ class Sequence:
 
 def filter_sequence(
     *,
-    observation: Tensor,
-    observed: Tensor,
-    previous_action: Tensor,
-    reset: Tensor,
-    start_mean: Tensor,
-    start_cov: Tensor | None = None,
-    initial_mean: Tensor,
-    initial_cov: Tensor,
-    transition: Transition,
-    transition_cov: Tensor | Transition,
-    matrix: Tensor,
-    noise: Tensor | Callable[..., Tensor],
-    action_matrix: Tensor | None = None,
-    bias: Tensor | None = None,
-    jacobian: Tensor | Transition | None = None,
-    use_stored_state: Tensor | None = None,
-    stored_mean: Tensor | None = None,
-    stored_cov: Tensor | None = None,
-) -> Sequence:
+    observation,
+    observed,
+    previous_action,
+    reset,
+    start_mean,
+    start_cov=None,
+    initial_mean,
+    initial_cov,
+    transition,
+    transition_cov,
+    matrix,
+    noise,
+    action_matrix=None,
+    bias=None,
+    jacobian=None,
+    use_stored_state=None,
+    stored_mean=None,
+    stored_cov=None,
+):
     """Filter [batch, time] data one row and one step at a time.
 
     `start_mean` (b, s) is the filtered belief of the step before the first one. At a step with
@@ -153,12 +137,10 @@ def filter_sequence(
     )
 
 
-def mean_network(
-    weights: list[Tensor], biases: list[Tensor], residual: bool, activation: str
-) -> Transition:
+def mean_network(weights, biases, residual, activation):
     """Eq. (8) as a plain function: layers of W z + b with relu or tanh between them."""
 
-    def transition(mean: Tensor, action: Tensor) -> Tensor:
+    def transition(mean, action):
         z = torch.cat([mean, action], -1)
         for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
             if i > 0:
@@ -184,41 +166,39 @@ class LinearSystem:
     initial_cov: Tensor  # shape: (s, s)
 
     @property
-    def state_dim(self) -> int:
+    def state_dim(self):
         return self.matrix.shape[1]
 
     @property
-    def obs_dim(self) -> int:
+    def obs_dim(self):
         return self.matrix.shape[0]
 
     @property
-    def action_dim(self) -> int:
+    def action_dim(self):
         return self.control.shape[1]
 
-    def transition(self, mean: Tensor, action: Tensor) -> Tensor:
+    def transition(self, mean, action):
         return mean @ self.dynamics.T + action @ self.control.T
 
-    def offset(self, action: Tensor) -> Tensor:
+    def offset(self, action):
         return action @ self.action_matrix.T + self.bias
 
-    def to(self, dtype: torch.dtype) -> LinearSystem:
+    def to(self, dtype):
         return replace(self, **{k: v.to(dtype) for k, v in vars(self).items()})
 
 
-def spd(dim: int, generator: torch.Generator, scale: float = 1.0) -> Tensor:
+def spd(dim, generator, scale=1.0):
     """A well-conditioned random covariance of standard deviation about `scale`."""
     a = torch.randn(dim, dim, generator=generator, dtype=torch.float64)
     cov = scale**2 * (a @ a.T / dim + 0.3 * torch.eye(dim, dtype=torch.float64))
     return (cov + cov.T) / 2
 
 
-def random_system(
-    state: int, obs: int, action: int = 2, *, seed: int = 0, full_noise: bool = False
-) -> LinearSystem:
+def random_system(state, obs, action=2, *, seed=0, full_noise=False):
     """A random stable system with an initial covariance that has nothing to do with Q."""
     g = torch.Generator().manual_seed(seed)
 
-    def randn(*shape: int) -> Tensor:
+    def randn(*shape):
         return torch.randn(*shape, generator=g, dtype=torch.float64)
 
     diagonal = (0.2 + 0.5 * torch.rand(obs, generator=g, dtype=torch.float64)) ** 2
@@ -246,22 +226,14 @@ class Data:
     start_mean: Tensor
 
 
-def simulate(
-    system: LinearSystem,
-    batch: int,
-    time: int,
-    *,
-    seed: int = 0,
-    missing_rate: float = 0.4,
-    reset_rate: float = 0.0,
-) -> Data:
+def simulate(system, batch, time, *, seed=0, missing_rate=0.4, reset_rate=0.0):
     """Draw data from the system with independent dropouts and, if asked, resets inside rows.
 
     Where it fits, one frame holds nothing, one holds a single entry and one holds everything.
     """
     g = torch.Generator().manual_seed(1000 + seed)
 
-    def randn(*shape: int) -> Tensor:
+    def randn(*shape):
         return torch.randn(*shape, generator=g, dtype=torch.float64)
 
     n, s = system.obs_dim, system.state_dim
@@ -291,7 +263,7 @@ def simulate(
     return Data(observation, observed, action, reset, start_mean)
 
 
-def joint_gaussian(system: LinearSystem, data: Data, row: int) -> tuple[Tensor, ...]:
+def joint_gaussian(system, data, row):
     """Mean m and covariance P of all states of a row, and H, R, x of all that arrived.
 
     The states are one Gaussian vector and x = H m + noise, missing entries deleted. No filter is
@@ -320,7 +292,7 @@ def joint_gaussian(system: LinearSystem, data: Data, row: int) -> tuple[Tensor, 
     return torch.cat(means), prior, H, R, data.observation[row].flatten()[seen] - offset
 
 
-def statsmodels(system: LinearSystem, data: Data) -> Any:
+def statsmodels(system, data):
     """Bind the first row to statsmodels' filter and smoother."""
     from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 

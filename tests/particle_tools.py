@@ -1,10 +1,7 @@
 """A small particle filter of fixed parameters, and frames for it."""
 
-from typing import Any
-
 import torch
 from contracts import ACTION, OBS, BeliefModuleContract
-from tensordict import TensorDict
 
 from torchrl_drbpn import ParticleFilter
 from torchrl_drbpn.functional import ParticleNoise
@@ -13,9 +10,7 @@ K, HIDDEN, LATENT = 4, 6, 3
 OPTIONAL = (("belief", "observation"), ("belief", "latent"), ("belief", "effective_sample_size"))
 
 
-def make_filter(
-    obs: int = OBS, action: int = ACTION, dtype: torch.dtype | None = None, **kwargs: Any
-) -> ParticleFilter:
+def make_filter(obs=OBS, action=ACTION, dtype=None, **kwargs):
     """A small filter of fixed parameters."""
     sizes = {"num_particles": K, "hidden_dim": HIDDEN, "latent_dim": LATENT}
     sizes |= {"encoder_sizes": (7, 5), "action_width": 3}
@@ -24,11 +19,11 @@ def make_filter(
         return ParticleFilter(obs, action, dtype=dtype, **(sizes | kwargs))
 
 
-def make_frames(shape: tuple[int, ...], seed: int = 0) -> TensorDict:
+def make_frames(shape, seed=0):
     return BeliefModuleContract().make_frames(shape, torch.float64, seed)
 
 
-def sample_noise(shape: tuple[int, ...], particles: int, latent: int, seed: int) -> ParticleNoise:
+def sample_noise(shape, particles, latent, seed):
     """The float64 noise of independent steps."""
     g = torch.Generator().manual_seed(seed)
     proposal = torch.randn(*shape, particles, latent, generator=g, dtype=torch.float64)

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 FLAGS = "-O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all"
 
 
-def main() -> int:
+def main():
     """Build into a copy, run the tests and the fuzz there; the exit status is the worst of both."""
     compiler = os.environ.get("CC", "cc")
     with tempfile.TemporaryDirectory() as folder:
@@ -56,7 +56,7 @@ def main() -> int:
     return worst
 
 
-def fuzz(count: int = 400) -> None:
+def fuzz(count=400):
     """Call the operator and its gradient with random sizes, half of the calls with one spoilt."""
     import torch
     from filter_problems import Problem

@@ -1,7 +1,6 @@
 """An environment that starts the next episode by itself, as TorchRL's native auto-reset ones do."""
 
 from contracts import StaircaseEnv
-from tensordict import TensorDict, TensorDictBase
 
 __all__ = ["SelfResettingEnv"]
 
@@ -9,11 +8,11 @@ __all__ = ["SelfResettingEnv"]
 class SelfResettingEnv(StaircaseEnv):
     """A staircase whose step returns the first observation of the next episode where one ends."""
 
-    def __init__(self, batch: int = 3, horizon: int = 3) -> None:
+    def __init__(self, batch=3, horizon=3):
         super().__init__(batch=batch, horizon=horizon)
         self._torchrl_native_autoreset = True
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def _step(self, tensordict):
         data = super()._step(tensordict)
         ended = data["done"]
         self.time = self.time.masked_fill(ended.squeeze(-1), 0)

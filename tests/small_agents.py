@@ -6,11 +6,9 @@ holds both ends inside rows, and the second one begins in mid-episode.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from contract_environments import with_belief_entries
-from tensordict import TensorDictBase
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictSequential,
@@ -40,24 +38,16 @@ class Agent:
     norm: TensorDictModuleBase | None = None
 
     @property
-    def policy(self) -> ProbabilisticTensorDictSequential:
+    def policy(self):
         first = [] if self.norm is None else [self.norm]
         return ProbabilisticTensorDictSequential(*first, self.belief, *self.actor.module)
 
     @property
-    def value(self) -> TensorDictSequential:
+    def value(self):
         return TensorDictSequential(self.belief, self.critic)
 
 
-def make_filter(
-    obs: int,
-    action: int,
-    dtype: torch.dtype | None = None,
-    state: int | None = None,
-    cov_network: bool = False,
-    perturb: bool = True,
-    **kwargs: Any,
-) -> BeliefFilter:
+def make_filter(obs, action, dtype=None, state=None, cov_network=False, perturb=True, **kwargs):
     """A filter of fixed parameters, all away from their starting values if `perturb`."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -76,15 +66,15 @@ def make_filter(
 
 
 def make_agent(
-    belief: TensorDictModuleBase,
-    feature_dim: int,
+    belief,
+    feature_dim,
     *,
-    features: str = "features",
-    dtype: torch.dtype = torch.float64,
-    init_std: float = 2.0,
-    actions: int = ACTION,
-    norm: TensorDictModuleBase | None = None,
-) -> Agent:
+    features="features",
+    dtype=torch.float64,
+    init_std=2.0,
+    actions=ACTION,
+    norm=None,
+):
     """Heads of fixed weights; a wide policy makes the poles fall soon."""
     with torch.random.fork_rng():
         torch.manual_seed(1)
@@ -104,7 +94,7 @@ def make_agent(
     return Agent(belief, actor, critic, norm)
 
 
-def make_env(dtype: torch.dtype = torch.float64, seed: int = 0) -> TransformedEnv:
+def make_env(dtype=torch.float64, seed=0):
     """Three pendulums, half of the entries missing; the primer is left to the collector."""
     base = GymnasiumBatchEnv(
         "InvertedPendulum-v5", ENVS, seed=seed, dtype=dtype, max_episode_steps=LIMIT
@@ -112,12 +102,7 @@ def make_env(dtype: torch.dtype = torch.float64, seed: int = 0) -> TransformedEn
     return with_belief_entries(TransformedEnv(base, Compose()), to_float32=False)
 
 
-def collect(
-    agent: Agent,
-    batches: int = 2,
-    dtype: torch.dtype = torch.float64,
-    env: TransformedEnv | None = None,
-) -> TensorDictBase:
+def collect(agent, batches=2, dtype=torch.float64, env=None):
     """The last of some batches of (ENVS, TIME) steps: rows that start in mid-episode."""
     with torch.random.fork_rng():
         torch.manual_seed(2)
@@ -135,13 +120,13 @@ def collect(
     return data
 
 
-def make_gae(agent: Agent, **kwargs: Any) -> GAE:
+def make_gae(agent, **kwargs):
     """TorchRL's GAE through the belief module."""
     keys = {"value_network": agent.value, "deactivate_vmap": True} | kwargs
     return GAE(gamma=GAMMA, lmbda=LMBDA, **keys)
 
 
-def add_advantages(agent: Agent, data: TensorDictBase) -> TensorDictBase:
+def add_advantages(agent, data):
     """Write advantages into a rollout."""
     with set_recurrent_mode(True), torch.no_grad():
         make_gae(agent)(data)

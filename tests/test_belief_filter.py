@@ -32,7 +32,7 @@ class Inputs(NamedTuple):
     reset: Tensor
 
 
-def make_inputs(state: int, batch: tuple[int, ...] = (3,), time: int = 6, seed: int = 0) -> Inputs:
+def make_inputs(state, batch=(3,), time=6, seed=0):
     """Sequences with a reset inside one row, a frame of nothing and a frame of everything."""
     g = torch.Generator().manual_seed(seed)
     shape = (*batch, time)
@@ -56,14 +56,14 @@ def make_inputs(state: int, batch: tuple[int, ...] = (3,), time: int = 6, seed: 
 class SineTransition(nn.Module):
     """A transition of the user's own: s' = s + sin(W s) + C a, Q growing with the state."""
 
-    def __init__(self, state: int) -> None:
+    def __init__(self, state):
         super().__init__()
         g = torch.Generator().manual_seed(3)
         self.state_dim, self.action_dim = state, ACTION
         self.W = nn.Parameter(torch.randn(state, state, generator=g, dtype=F64))
         self.C = nn.Parameter(torch.randn(state, ACTION, generator=g, dtype=F64))
 
-    def forward(self, mean: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, mean, action):
         moved = mean + torch.sin(mean @ self.W.mT) + action @ self.C.mT
         return moved, torch.diag_embed(0.1 + 0.1 * mean.square())
 
@@ -81,7 +81,7 @@ KINDS = {
 }
 
 
-def make_kind(kind: str, state: int, noise: str = "diag") -> BeliefFilter:
+def make_kind(kind, state, noise="diag"):
     """A filter with every parameter away from its start."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -100,7 +100,7 @@ def test_values_and_gradients_equal_a_hand_loop(kind, state, noise):
     for name in ("mean", "cov", "log_likelihood"):
         same(getattr(out, name), getattr(expected, name))
 
-    def gradient(mean: Tensor, ll: Tensor) -> list[Tensor | None]:
+    def gradient(mean, ll):
         total = (mean * torch.linspace(-1, 1, mean.shape[-1], dtype=F64)).sum() + ll.sum()
         return torch.autograd.grad(total, list(model.parameters()))
 

@@ -9,7 +9,7 @@ from filter_problems import by_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_agents import make_filter as make_any_filter
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_drbpn import BeliefFilter, BeliefFilterModule, LinearGaussianEmission, functional
@@ -26,7 +26,7 @@ make_filter = functools.partial(make_any_filter, OBS, ACTION)
 make_frames = functools.partial(BeliefModuleContract().make_frames, dtype=torch.float64)
 
 
-def with_state(frames: TensorDict, state: int) -> TensorDict:
+def with_state(frames, state):
     """`frames` with a recurrent state in mid-episode."""
     g = torch.Generator().manual_seed(9)
     shape, dtype = frames.shape, frames["observation"].dtype
@@ -44,7 +44,7 @@ class TestContract(BeliefModuleContract):
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
         return BeliefFilterModule(make_any_filter(obs, action, dtype), **kwargs)
 
-    def differentiable(self, out: TensorDictBase) -> torch.Tensor:
+    def differentiable(self, out):
         return out["features"].square().mean() - out["belief", "log_likelihood"].mean()
 
 
@@ -242,7 +242,7 @@ def test_autocast_leaves_the_filter_in_its_own_dtype():
     data = make_frames((3, 6), obs=9, dtype=torch.float32)
     data["is_init"][:, 0] = True
 
-    def run(autocast: bool, over_time: bool) -> list[torch.Tensor]:
+    def run(autocast, over_time):
         frames = with_state(data, module.filter.state_dim)[:, slice(None) if over_time else 0]
         with (
             torch.autocast("cpu", dtype=torch.bfloat16, enabled=autocast),

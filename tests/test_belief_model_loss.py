@@ -11,12 +11,12 @@ OBS, BATCH, TIME = 4, 3, 5
 MASK = r"`observed` must be bool of shape \(\*batch, obs\)"
 
 
-def make_data(dtype: torch.dtype = torch.float32, seed: int = 0) -> TensorDict:
+def make_data(dtype=torch.float32, seed=0):
     """Log-likelihoods and masks of a rollout, with its next step; done inside rows."""
     g = torch.Generator().manual_seed(seed)
     shape = (BATCH, TIME)
 
-    def part() -> dict:
+    def part():
         observed = torch.rand(*shape, OBS, generator=g) < 0.5
         ll = torch.randn(*shape, generator=g, dtype=dtype)
         ll = torch.where(observed.any(-1), ll, 0.0)
@@ -31,7 +31,7 @@ def make_data(dtype: torch.dtype = torch.float32, seed: int = 0) -> TensorDict:
     return data
 
 
-def counted(data: TensorDict) -> tuple[torch.Tensor, int, int]:
+def counted(data):
     """Sum of log-likelihoods, entries and steps that count, one step at a time."""
     total, entries, steps = torch.zeros((), dtype=torch.float64), 0, 0
     for b in range(BATCH):

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 from oracles import spd
-from torch import Tensor
 
 from torchrl_drbpn.functional import (
     Belief,
@@ -22,11 +21,11 @@ sys.path.append(str(Path(__file__).parents[1] / "docs/calibration"))
 import constant_covariance
 
 
-def randn(*shape: int, seed: int = 0) -> Tensor:
+def randn(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_the_consistency_test_passes_errors_of_the_claimed_covariance_and_no_others() -> None:
+def test_the_consistency_test_passes_errors_of_the_claimed_covariance_and_no_others():
     cov = spd(4, torch.Generator().manual_seed(3))
     error = randn(10_000, 4) @ torch.linalg.cholesky(cov).mT
     seen = randn(10_000, 4, seed=1) < torch.linspace(-1, 2, 10_000)[:, None]  # some see nothing
@@ -42,7 +41,7 @@ def test_the_consistency_test_passes_errors_of_the_claimed_covariance_and_no_oth
     assert too_large.ratio < too_large.lower
 
 
-def test_a_constant_covariance_is_too_small_in_outages_though_its_average_nis_is_right() -> None:
+def test_a_constant_covariance_is_too_small_in_outages_though_its_average_nis_is_right():
     """The figures of docs/calibration.md, on fewer and shorter sequences."""
     model = constant_covariance.system()
     case = (0.5, 20.0, False)
@@ -72,7 +71,7 @@ def test_a_constant_covariance_is_too_small_in_outages_though_its_average_nis_is
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_masking_an_entry_equals_deleting_its_row(seed: int) -> None:
+def test_masking_an_entry_equals_deleting_its_row(seed):
     g = torch.Generator().manual_seed(seed)
     cov, error = spd(5, g), randn(5, seed=seed)
     seen = torch.tensor([True, False, True, True, False])
@@ -110,9 +109,7 @@ def test_chi_square_quantiles_equal_the_closed_forms_and_approach_the_normal_one
 
 
 @pytest.mark.parametrize(("obs", "state", "spread"), [(17, 4, 3.0), (27, 8, 1.0), (105, 16, 1.0)])
-def test_a_float32_belief_at_the_noise_floor_has_the_nis_of_float64(
-    obs: int, state: int, spread: float
-) -> None:
+def test_a_float32_belief_at_the_noise_floor_has_the_nis_of_float64(obs, state, spread):
     """H of low rank, R std .01: in float32 the innovation covariance has no Cholesky factor."""
     matrix, predicted = randn(obs, state), spread * randn(20, state, seed=1)
     cov, noise = spread**2 * torch.eye(state), 1e-4 * torch.eye(obs)

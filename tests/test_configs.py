@@ -1,7 +1,5 @@
 """Nodes for Hydra configurations of `torchrl.trainers`."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -47,7 +45,7 @@ REQUIRED: dict[str, dict[str, Any]] = {
 }  # what a constructor requires
 
 
-def nodes() -> dict[tuple[str, str], Any]:
+def nodes():
     """Every node of a group, by group and name."""
     groups = {
         g: named for g, named in ConfigStore.instance().repo.items() if isinstance(named, dict)
@@ -60,7 +58,7 @@ def nodes() -> dict[tuple[str, str], Any]:
     }
 
 
-def composed(*overrides: str) -> Any:
+def composed(*overrides):
     register()
     with initialize_config_dir(str(GUIDE), version_base="1.3"):
         return compose("trainer", [*SHORT, *overrides])

@@ -3,9 +3,6 @@
 "meta" stands for a device that isn't the CPU: it refuses to be mixed with it, as a GPU does.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -86,7 +83,7 @@ def test_normalisation_and_the_robots_step_stay_with_their_input():
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("overrides", [(), ("belief=gru",), ("belief=dvrl",), ("method=acktr",)])
-def test_a_run_on_a_gpu_goes_on_on_the_cpu_and_back(overrides, tmp_path: Path):
+def test_a_run_on_a_gpu_goes_on_on_the_cpu_and_back(overrides, tmp_path):
     folder = tmp_path / "run"
     assert run(folder, *SMOKE, "device=cuda", *overrides) == 0
     training = assemble(make_config(*SMOKE, "device=cuda", *overrides))

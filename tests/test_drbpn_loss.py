@@ -6,8 +6,7 @@ import oracles
 import pytest
 import torch
 from contracts import LossContract
-from small_agents import ACTION, OBS, TIME, Agent, add_advantages, collect, make_agent, make_filter
-from tensordict import TensorDictBase
+from small_agents import ACTION, OBS, TIME, add_advantages, collect, make_agent, make_filter
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
@@ -19,42 +18,42 @@ PPO_TERMS = ("loss_objective", "loss_critic", "loss_entropy")
 filters = pytest.mark.parametrize("covariance", ["constant", "propagated"])
 
 
-def make_belief_agent(dtype: torch.dtype = torch.float64, covariance: str = "constant") -> Agent:
+def make_belief_agent(dtype=torch.float64, covariance="constant"):
     belief = BeliefFilterModule(make_filter(OBS, ACTION, dtype, covariance=covariance))
     return make_agent(belief, belief.feature_dim, dtype=dtype)
 
 
 @functools.cache
-def rollout(*args) -> TensorDictBase:
+def rollout(*args):
     """Fresh data of `make_belief_agent`, with advantages; cloned by `make_data`."""
     agent = make_belief_agent(*args)
     dtype = next(agent.belief.parameters()).dtype
     return add_advantages(agent, collect(agent, dtype=dtype))
 
 
-def make_data(*args) -> TensorDictBase:
+def make_data(*args):
     data = rollout(*args).clone()
     final = torch.zeros(*data.shape, 1, dtype=torch.bool)
     final[:, -1] = True
     return data.set("final", final)
 
 
-def make_ppo(agent: Agent, **kwargs) -> ClipPPOLoss:
+def make_ppo(agent, **kwargs):
     kwargs = {"normalize_advantage": True, **kwargs}
     return ClipPPOLoss(agent.actor, agent.critic, **kwargs)
 
 
-def make_loss(agent: Agent | None = None, *, ppo: dict | None = None, **kwargs) -> DRBPNLoss:
+def make_loss(agent=None, *, ppo=None, **kwargs):
     agent = make_belief_agent() if agent is None else agent
     model = kwargs.pop("model", None) or BeliefModelLoss()
     return DRBPNLoss(agent.belief, make_ppo(agent, **(ppo or {})), model, **kwargs)
 
 
-def as_dtype(data: TensorDictBase, dtype: torch.dtype) -> TensorDictBase:
+def as_dtype(data, dtype):
     return data.apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
 
 
-def cut(data: TensorDictBase, length: int) -> TensorDictBase:
+def cut(data, length):
     """Sequences cut from the rows of a rollout, [rows * time / length, length]."""
     return data.reshape(-1).reshape(-1, length)
 
@@ -82,7 +81,7 @@ class TestContractWithoutAModel(LossContract):
         return as_dtype(add_advantages(agent, collect(agent, dtype=torch.float32)), dtype)
 
 
-def make_gru_loss(model: BeliefModelLoss | None = None) -> tuple[Agent, DRBPNLoss]:
+def make_gru_loss(model=None):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         gru = GRUModule(input_size=OBS, hidden_size=6, in_key="observation", out_key="features")
@@ -119,7 +118,7 @@ def test_compiled_ahead_of_time_the_gradients_are_the_same():
     torch.testing.assert_close(*grads, rtol=1e-9, atol=1e-12)
 
 
-def reference(agent: Agent, data: TensorDictBase) -> tuple[TensorDictBase, list]:
+def reference(agent, data):
     """ClipPPOLoss after a pass of the belief module, and its gradients by all parameters."""
     beliefs = data.copy()
     with set_recurrent_mode(True):
@@ -128,7 +127,7 @@ def reference(agent: Agent, data: TensorDictBase) -> tuple[TensorDictBase, list]
     return out, gradients(agent, sum(out[key] for key in PPO_TERMS))
 
 
-def gradients(agent: Agent, total: torch.Tensor) -> list[torch.Tensor]:
+def gradients(agent, total):
     parts = (agent.belief, agent.actor, agent.critic)
     parameters = [p for part in parts for p in part.parameters()]
     return torch.autograd.grad(
@@ -136,11 +135,11 @@ def gradients(agent: Agent, total: torch.Tensor) -> list[torch.Tensor]:
     )
 
 
-def summed(out: TensorDictBase) -> torch.Tensor:
+def summed(out):
     return sum(value for key, value in out.items() if key.startswith("loss"))
 
 
-def assert_identical(received: TensorDictBase, expected: TensorDictBase) -> None:
+def assert_identical(received, expected):
     for key, value in expected.items():
         assert torch.equal(received[key], value), key
 
@@ -190,7 +189,7 @@ def test_a_detached_belief_learns_from_the_model_alone():
     assert all(map(torch.equal, *from_model))
 
 
-def counted(agent: Agent, data: TensorDictBase) -> tuple[torch.Tensor, int]:
+def counted(agent, data):
     """Log-likelihood of every received observation, and entries, from the row-deleting oracle.
 
     Received are: the frame that a row begins with, the frame after every action, and the first
@@ -347,7 +346,7 @@ def test_a_filter_with_keys_of_its_own_is_served():
 
 def test_what_a_head_reads_beside_the_features_is_among_the_in_keys():
     class Joined(nn.Linear):
-        def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        def forward(self, *inputs):
             return super().forward(torch.cat(inputs, -1))
 
     agent, data = make_belief_agent(), make_data()

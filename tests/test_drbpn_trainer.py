@@ -31,14 +31,14 @@ FRAMES, SLICE = ENVS * TIME, 3
 TRAJECTORY = ("collector", "traj_ids")
 
 
-def make_loss(**kwargs) -> DRBPNLoss:
+def make_loss(**kwargs):
     belief = BeliefFilterModule(make_filter(OBS, ACTION, torch.float64))
     agent = make_agent(belief, belief.feature_dim)
     ppo = ClipPPOLoss(agent.actor, agent.critic, log_explained_variance=False)
     return DRBPNLoss(belief, ppo, BeliefModelLoss(**kwargs))
 
 
-def fresh(loss: DRBPNLoss) -> TensorDictBase:
+def fresh(loss):
     """A rollout of the loss's own policy, with advantages."""
     belief, heads = loss.filter_network, loss.ppo_loss
     agent = make_agent(belief, belief.feature_dim)
@@ -46,7 +46,7 @@ def fresh(loss: DRBPNLoss) -> TensorDictBase:
     return add_advantages(agent, collect(agent))
 
 
-def sliced(data: TensorDictBase, length: int = SLICE, slices: int = 40) -> TensorDictBase:
+def sliced(data, length=SLICE, slices=40):
     """Slices as TorchRL's sampler draws and marks them by default, one after the other."""
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(data.numel()),

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 from filter_problems import FORMS, SIZES, Problem, assert_equal, assert_same
-from torch import Tensor
 
 from torchrl_drbpn.functional import filter_sequence, filter_step, filtered_cov
 
@@ -244,7 +243,7 @@ def test_every_form_can_be_differentiated_twice(obs, form):
     problem = Problem(3, obs, batch=1, time=3, hidden=(3,), stored=True)
     names = ("bias0", "noise", "matrix", "observation", "stored_mean", "initial_mean")
 
-    def run(*leaves: Tensor) -> Tensor:
+    def run(*leaves):
         problem.leaves |= dict(zip(names, leaves, strict=True))
         mean, _, ll = problem.library(form)
         return mean.square().sum() + ll.sum()

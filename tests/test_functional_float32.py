@@ -3,15 +3,12 @@
 import pytest
 import torch
 from filter_problems import FORMS, SIZES, Problem
-from torch import Tensor
 
 from torchrl_drbpn import functional as F
 from torchrl_drbpn.functional import Belief, filter_step
 
 
-def at_the_noise_floor(
-    state: int, obs: int, *, full_noise: bool = False, rank: int | None = None, spread: float = 0.3
-) -> tuple[Problem, Problem]:
+def at_the_noise_floor(state, obs, *, full_noise=False, rank=None, spread=0.3):
     """Return one problem in float32 and the same numbers in float64: R std 1e-2, Q std .3.
 
     H is random, of full rank where none is given; `spread` is the Q std. Masks are of every
@@ -23,7 +20,7 @@ def at_the_noise_floor(
     double = Problem(state, obs, full_noise=full_noise, **options)
     leaves, g = double.leaves, torch.Generator().manual_seed(0)
 
-    def randn(*shape: int) -> Tensor:
+    def randn(*shape):
         return torch.randn(*shape, generator=g, dtype=torch.float64)
 
     density = torch.linspace(0, 1, time).view(1, time, 1)
@@ -114,13 +111,13 @@ def test_a_float32_step_keeps_its_digits_at_the_noise_floor(state, obs, full_noi
     assert float(relative.max()) < 1e-3
 
 
-def smallest_eigenvalues(cov: Tensor) -> Tensor:
+def smallest_eigenvalues(cov):
     assert torch.isfinite(cov).all()
     assert torch.equal(cov, cov.mT)
     return torch.linalg.eigvalsh(cov.double())[..., 0]
 
 
-def a_step(state: int, obs: int, batch: int, seed: int, *, full_noise: bool):
+def a_step(state, obs, batch, seed, *, full_noise):
     """H, Q of std .3, R of std 1e-2 and a predicted belief of covariance Q."""
     g = torch.Generator().manual_seed(seed)
     h, q, r = torch.randn(obs, state, generator=g), 0.09 * torch.eye(state), 1e-4 * torch.eye(obs)

@@ -9,7 +9,6 @@ import oracles
 import pytest
 import torch
 from filter_problems import assert_equal, outputs
-from torch import Tensor
 
 from torchrl_drbpn import functional as F
 from torchrl_drbpn.functional.gaussian import (
@@ -28,7 +27,7 @@ seeded = pytest.mark.parametrize("seed", [0, 1, 2])
 FUNCTIONS = ["innovation", "update", "log_likelihood"]
 
 
-def given(state: int, obs: int, *, seed: int = 0, full_noise: bool = True):
+def given(state, obs, *, seed=0, full_noise=True):
     """The arguments of a step, whose rows observe one entry, all, some and none; a generator."""
     system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
     g = torch.Generator().manual_seed(seed + 77)
@@ -41,7 +40,7 @@ def given(state: int, obs: int, *, seed: int = 0, full_noise: bool = True):
     return (Belief(mean, cov), x, observed, system.matrix, system.noise, offset), g
 
 
-def vector(*values: float) -> Tensor:
+def vector(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
@@ -226,11 +225,11 @@ MASKS = pytest.mark.parametrize(
 )
 
 
-def generator(seed: int = 0) -> torch.Generator:
+def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def case(mask: list[bool], batch: int = 3) -> tuple[Tensor, Tensor, Tensor]:
+def case(mask, batch=3):
     g = generator()
     residual = torch.randn(batch, 4, generator=g, dtype=torch.float64)
     cov = torch.stack([oracles.spd(4, g) for _ in range(batch)])

@@ -22,7 +22,7 @@ CASES = DIMS | {
 }
 
 
-def draw(state, obs, seed, batch, share, full_noise, dtype) -> tuple[list, torch.Generator]:
+def draw(state, obs, seed, batch, share, full_noise, dtype):
     """A predicted belief, readings, mask, H, R and offsets, as `update` takes them."""
     g = torch.Generator().manual_seed(seed)
     system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise).to(dtype)
@@ -34,7 +34,7 @@ def draw(state, obs, seed, batch, share, full_noise, dtype) -> tuple[list, torch
     return [belief, x.to(dtype), observed, system.matrix, system.noise, offset.to(dtype)], g
 
 
-def assert_near(actual, expected, dtype: torch.dtype = torch.float64) -> None:
+def assert_near(actual, expected, dtype=torch.float64):
     limit = 1e-10 if dtype == torch.float64 else 1e-3
     for a, e in zip(actual, expected, strict=True):
         torch.testing.assert_close(a, e.to(a.dtype), rtol=limit, atol=limit)

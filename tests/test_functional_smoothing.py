@@ -6,7 +6,6 @@ import oracles
 import pytest
 import torch
 from filter_problems import Problem, assert_equal
-from torch import Tensor
 
 from torchrl_drbpn import BeliefFilter
 from torchrl_drbpn.functional import (
@@ -18,28 +17,26 @@ from torchrl_drbpn.functional import (
 )
 
 
-def space(system: oracles.LinearSystem) -> StateSpace:
+def space(system):
     return StateSpace(
         system.transition, system.transition_cov, system.matrix, system.noise, system.action_matrix,
         system.bias, system.initial_mean, system.initial_cov,
     )  # fmt: skip
 
 
-def linear(
-    time: int = 7, *, batch: int = 3, reset_rate: float = 0.3, seed: int = 0
-) -> tuple[oracles.LinearSystem, oracles.Data]:
+def linear(time=7, *, batch=3, reset_rate=0.3, seed=0):
     system = oracles.random_system(3, 4, seed=seed, full_noise=True)
     data = oracles.simulate(system, batch, time, seed=seed, reset_rate=reset_rate)
     data.reset[:, 0] = True
     return system, data
 
 
-def inputs(data: oracles.Data, rows: slice = slice(None), steps: slice = slice(None)) -> list:
+def inputs(data, rows=slice(None), steps=slice(None)):
     sequence = (data.previous_action, data.observation, data.observed, data.reset)
     return [data.start_mean[rows], None, *(x[rows, steps] for x in sequence)]
 
 
-def joint_posterior(system: oracles.LinearSystem, data: oracles.Data, row: int) -> Belief:
+def joint_posterior(system, data, row):
     """All states of a row given all its readings, by conditioning one joint Gaussian."""
     time, s = data.reset.shape[1], system.state_dim
     mean, prior, H, R, x = oracles.joint_gaussian(system, data, row)
@@ -76,7 +73,7 @@ def test_it_is_the_joint_gaussian_conditioned_on_all_readings_with_its_gradients
         torch.testing.assert_close(a, b, atol=1e-8, rtol=1e-8, msg=lambda m, n=name: f"{n}: {m}")
 
 
-def textbook(problem: Problem, row: int, jacobian: Tensor | None) -> list[tuple[Tensor, Tensor]]:
+def textbook(problem, row, jacobian):
     """§9.1 [Särkkä 2013] for one row, step by step; F from torch.autograd unless given."""
     q, p, r = problem.covs()
     leaf, model = problem.leaves, problem.model()

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 from filter_problems import Problem, assert_equal
-from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
 
@@ -19,13 +18,13 @@ SIZES = pytest.mark.parametrize(
 )
 
 
-def total(problem: Problem):
+def total(problem):
     """A number of the start mean and of R, everything else fixed."""
     problem.leaves = {name: leaf.detach() for name, leaf in problem.leaves.items()}
     model, (_, *rest) = problem.model(), problem.arguments()
     stored = {**problem.stored(), "cov": problem.start_cov}
 
-    def run(start: Tensor, noise: Tensor) -> Tensor:
+    def run(start, noise):
         out = filter_sequence(replace(model, emission_cov=noise), start, *rest, **stored)
         return out.mean.square().sum() + out.log_likelihood.sum()
 
@@ -74,7 +73,7 @@ def test_exported_it_is_the_same(obs, propagated):
     run, given = total(Problem(3, obs, propagated=propagated, time=3))
 
     class Module(torch.nn.Module):
-        def forward(self, start: Tensor, noise: Tensor) -> Tensor:
+        def forward(self, start, noise):
             return run(start, noise)
 
     with torch.no_grad():

@@ -22,7 +22,7 @@ from torchrl_drbpn.functional import (
 DOUBLE = {"dtype": torch.float64}
 
 
-def phi(z: torch.Tensor) -> torch.Tensor:
+def phi(z):
     return torch.special.ndtr(math.sqrt(math.pi / 8) * z)
 
 
@@ -41,7 +41,7 @@ def test_one_missing_entry_has_the_moments_and_probability_of_numerical_integrat
     exact = (weight * s).sum() / Z
     spread = (weight * (s - exact) ** 2).sum() / Z
 
-    def vector(x: float) -> torch.Tensor:
+    def vector(x):
         return torch.tensor([x], **DOUBLE)
 
     after, log_mask = update_by_mask(
@@ -53,7 +53,7 @@ def test_one_missing_entry_has_the_moments_and_probability_of_numerical_integrat
     assert_equal(log_mask, Z.log(), 1e-6)
 
 
-def system(mask_model: MaskModel | None = None, *, propagated: bool = True) -> StateSpace:
+def system(mask_model=None, *, propagated=True):
     """Let s' = .95 s + N(0, .3^2), seen by sensors with a noise of .2."""
     eye = torch.eye(1, **DOUBLE)
     ones = torch.ones(2, 1, **DOUBLE)
@@ -63,11 +63,11 @@ def system(mask_model: MaskModel | None = None, *, propagated: bool = True) -> S
     )  # fmt: skip
 
 
-def high_readings_are_missing(rows: int = 150, time: int = 40) -> tuple:
+def high_readings_are_missing(rows=150, time=40):
     """Return the states and what the filter is given: P(arrives) = 1 / (1 + exp(3 x))."""
     g = torch.Generator().manual_seed(0)
 
-    def noise(*shape: int) -> torch.Tensor:
+    def noise(*shape):
         return torch.randn(*shape, generator=g, **DOUBLE)
 
     states = [noise(rows)]
@@ -89,7 +89,7 @@ def test_learning_why_readings_are_missing_removes_most_of_the_bias():
     parameters = torch.zeros(2, 2, **DOUBLE, requires_grad=True)
     optimizer = torch.optim.LBFGS([parameters], max_iter=8, line_search_fn="strong_wolfe")
 
-    def loss() -> torch.Tensor:
+    def loss():
         optimizer.zero_grad()
         out = filter_sequence(system(MaskModel(*parameters)), *given, cov=cov)
         value = -out.log_likelihood.mean()
@@ -135,7 +135,7 @@ def test_gradients_agree_with_finite_differences_at_a_slope_of_zero_too():
     """With the constant covariance: a propagated one is a constant of autograd by design."""
     _, given = high_readings_are_missing(2, 4)
 
-    def likelihood(parameters: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+    def likelihood(parameters, noise):
         model = system(MaskModel(*parameters), propagated=False)
         return filter_sequence(replace(model, emission_cov=noise), *given).log_likelihood
 

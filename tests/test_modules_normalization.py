@@ -16,12 +16,12 @@ OBS = 3
 DOUBLE = torch.float64
 
 
-def make_rollout(seed: int = 0, batch=(4,), time: int = 25, missing: float = 0.3) -> TensorDict:
+def make_rollout(seed=0, batch=(4,), time=25, missing=0.3):
     """Draw readings in order; an episode ends after 10 steps, its last reading is a next one."""
     generator = torch.Generator().manual_seed(seed)
     shape = (*batch, time, OBS)
 
-    def readings() -> tuple[torch.Tensor, torch.Tensor]:
+    def readings():
         x = torch.randn(shape, generator=generator, dtype=DOUBLE) * torch.arange(1, OBS + 1)
         seen = torch.rand(shape, generator=generator) >= missing
         return (x + 10 * torch.arange(OBS)).where(seen, 0.0), seen
@@ -46,7 +46,7 @@ def make_rollout(seed: int = 0, batch=(4,), time: int = 25, missing: float = 0.3
     )
 
 
-def received(rollout: TensorDict, component: int) -> torch.Tensor:
+def received(rollout, component):
     """Return the readings of a sensor that arrived, each once, by plain loops."""
     out = []
     for row in rollout.reshape(-1, rollout.shape[-1]):
@@ -57,18 +57,18 @@ def received(rollout: TensorDict, component: int) -> torch.Tensor:
     return torch.stack([s["observation"][component] for s in out if s["observed"][component]])
 
 
-def learned(*rollouts: TensorDict, **kwargs) -> MaskedObservationNorm:
+def learned(*rollouts, **kwargs):
     norm = MaskedObservationNorm(OBS, **kwargs)
     for rollout in rollouts:
         norm.update(rollout)
     return norm
 
 
-def state(norm: MaskedObservationNorm) -> list[torch.Tensor]:
+def state(norm):
     return [norm.count.double(), norm.mean, norm.var]
 
 
-def assert_same_state(first: MaskedObservationNorm, second: MaskedObservationNorm) -> None:
+def assert_same_state(first, second):
     for a, b in zip(state(first), state(second), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
 
@@ -208,7 +208,7 @@ def test_a_complete_observation_is_scaled_alike_and_not_learned_from():
     assert norm(make_rollout()).get(keys[1], None) is None
 
 
-def make_policy(norm: MaskedObservationNorm, width: int = OBS) -> TensorDictSequential:
+def make_policy(norm, width=OBS):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         head = TensorDictModule(
@@ -253,7 +253,7 @@ def test_compiled_without_a_break_it_is_the_same_and_sees_an_update_and_it_is_ex
         policy[0].update(make_rollout(seed + 5))
 
 
-def make_env() -> TransformedEnv:
+def make_env():
     base = GymnasiumBatchEnv("InvertedPendulum-v5", 2, seed=0, max_episode_steps=9)
     return TransformedEnv(base, Compose(ObservationMissingness("mcar", 0.5), InitTracker()))
 

@@ -6,7 +6,7 @@ from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequ
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, DoubleToFloat, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, DoubleToFloat, TransformedEnv
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
@@ -22,7 +22,7 @@ from torchrl_drbpn.modules import MaskedObservationNorm
 ENVS, OBS, ACTION, FRAMES, BATCHES = 4, 4, 1, 64, 4
 
 
-def make_env(last: list[Transform]) -> EnvBase:
+def make_env(last):
     noise = ObservationNoise(0.01)
     chain = Compose(DoubleToFloat(), noise, ObservationMissingness("mcar", 0.3), *last)
     env = TransformedEnv(GymnasiumBatchEnv("InvertedPendulum-v5", ENVS), chain)
@@ -30,7 +30,7 @@ def make_env(last: list[Transform]) -> EnvBase:
     return env
 
 
-def make_networks() -> tuple[ProbabilisticActor, ValueOperator]:
+def make_networks():
     class Network(nn.Sequential):
         """Reads which entries arrived as well."""
 

@@ -3,22 +3,16 @@
 PPO's invariants with it: test_pipeline.py.
 """
 
-from typing import Any
-
 import pytest
 import torch
 from contracts import ACTION, OBS, BeliefModuleContract
 from particle_tools import HIDDEN, LATENT, OPTIONAL, K, make_filter, make_frames, sample_noise
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torch.distributions import Normal
 from torchrl.modules import set_recurrent_mode
 
-from torchrl_drbpn import ParticleFilter, ParticleFilterModule
+from torchrl_drbpn import ParticleFilterModule
 from torchrl_drbpn.functional import (
     DiagonalGaussian,
-    ParticleNoise,
-    ParticleOutput,
     ParticleStep,
     ProposalOutput,
     StateSpace,
@@ -32,7 +26,7 @@ from torchrl_drbpn.functional import (
 from torchrl_drbpn.modules import particle_model
 
 
-def run(filter: ParticleFilter, data: TensorDict) -> tuple[ParticleOutput, ParticleNoise]:
+def run(filter, data):
     """Sequences from zeros, with the noise they were given."""
     shape, count = data.shape, filter.num_particles
     noise = sample_noise(shape, count, filter.latent_dim, 1)
@@ -42,20 +36,18 @@ def run(filter: ParticleFilter, data: TensorDict) -> tuple[ParticleOutput, Parti
     return filter(hidden, hidden[..., 0], begin, *parts, noise), noise
 
 
-def gru_cell(cell: torch.nn.GRUCell, x: Tensor, hidden: Tensor) -> Tensor:
+def gru_cell(cell, x, hidden):
     flat = cell(x.reshape(-1, x.shape[-1]), hidden.reshape(-1, hidden.shape[-1]))
     return flat.reshape(hidden.shape)
 
 
-def by_hand(
-    filter: ParticleFilter, hidden: Tensor, frame: TensorDict, epsilon: Tensor
-) -> tuple[Tensor, ...]:
+def by_hand(filter, hidden, frame, epsilon):
     """One particle, one step, network by network: log q, log p(z), log p(x | z), h, embedding."""
     x, m = frame["observation"], frame["observed"]
     seen = filter.encoder(torch.cat([x, m.double()], -1))
     action = filter.action_encoder(frame["previous_action"])
 
-    def normal(raw: Tensor, floor: float) -> Normal:
+    def normal(raw, floor):
         mean, spread = raw.chunk(2, -1)
         return Normal(mean, (torch.nn.functional.softplus(spread) + floor**2).sqrt())
 
@@ -153,7 +145,7 @@ def test_variances_never_fall_under_their_floor():
         torch.testing.assert_close(gaussian.variance, torch.full_like(gaussian.mean, floor**2))
 
 
-def noise_of(data: TensorDict, age: int = 0, **kwargs: Any) -> ParticleNoise:
+def noise_of(data, age=0, **kwargs):
     filter = make_filter(dtype=torch.float64, **kwargs)
     ages = torch.full((*data.shape, 1), age)
     return filter.noise(data["previous_action"], data["observation"], data["observed"], ages)
@@ -198,7 +190,7 @@ class TestContract(BeliefModuleContract):
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
         return ParticleFilterModule(make_filter(obs, action, dtype), **kwargs)
 
-    def differentiable(self, out: TensorDictBase) -> Tensor:
+    def differentiable(self, out):
         return out["features"].square().mean() - out["belief", "log_likelihood"].mean()
 
 
@@ -285,25 +277,25 @@ class LinearGaussian:
     The proposal is the transition widened.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         g = torch.Generator().manual_seed(3)
         self.A = 0.5 * torch.randn(3, 3, generator=g, dtype=torch.float64)
         self.B = torch.randn(3, 2, generator=g, dtype=torch.float64)
         self.Q, self.R, self.c = 0.2 + torch.rand(3, 3, generator=g, dtype=torch.float64)
 
-    def propose(self, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ProposalOutput:
+    def propose(self, hidden, inputs):
         mean = hidden @ self.A.mT + inputs[0].unsqueeze(-2) @ self.B.mT
         variance = self.Q.expand_as(mean)
         return ProposalOutput(
             DiagonalGaussian(mean, 1.5 * variance), DiagonalGaussian(mean, variance)
         )
 
-    def step(self, latent: Tensor, hidden: Tensor, inputs: tuple[Tensor, ...]) -> ParticleStep:
+    def step(self, latent, hidden, inputs):
         del hidden, inputs
         emission = DiagonalGaussian(self.c * latent, self.R.expand_as(latent))
         return ParticleStep(emission, latent, latent)
 
-    def run(self, data: tuple[Tensor, ...], particles: int, seeds: int) -> Tensor:
+    def run(self, data, particles, seeds):
         """Log-likelihood of the rows of `data`, (seeds, rows, time)."""
         x, m, action = (part.expand(seeds, *part.shape) for part in data)
         noise = sample_noise(x.shape[:-1], particles, 3, particles)
@@ -313,7 +305,7 @@ class LinearGaussian:
             self, hidden, hidden[..., 0], begin, (action,), x, m, noise
         ).log_likelihood
 
-    def kalman(self, data: tuple[Tensor, ...]) -> Tensor:
+    def kalman(self, data):
         """The same from the filter that carries the covariance along, (rows, time)."""
         x, m, action = data
         zero, start = x.new_zeros(3, 2), x.new_zeros(len(x), 3)
@@ -325,7 +317,7 @@ class LinearGaussian:
         return filter_sequence(model, start, action, x, m, reset, cov=cov).log_likelihood
 
 
-def linear_data(rows: int, time: int) -> tuple[Tensor, ...]:
+def linear_data(rows, time):
     g = torch.Generator().manual_seed(5)
     m = torch.rand(rows, time, 3, generator=g) < 0.7
     x, action = torch.randn(2, rows, time, 3, generator=g, dtype=torch.float64)

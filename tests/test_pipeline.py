@@ -11,13 +11,12 @@ from small_agents import (
     LMBDA,
     OBS,
     TIME,
-    Agent,
     collect,
     make_agent,
     make_filter,
     make_gae,
 )
-from tensordict import TensorDict, TensorDictBase, pad
+from tensordict import TensorDict, pad
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs.utils import step_mdp
@@ -30,7 +29,7 @@ from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss, Partic
 DTYPE, HIDDEN = torch.float32, 6
 
 
-def gru(**kwargs) -> GRUModule:
+def gru(**kwargs):
     return GRUModule(
         input_size=OBS,
         hidden_size=HIDDEN,
@@ -39,11 +38,11 @@ def gru(**kwargs) -> GRUModule:
     )
 
 
-def belief_filter(**kwargs) -> BeliefFilterModule:
+def belief_filter(**kwargs):
     return BeliefFilterModule(make_filter(OBS, ACTION, DTYPE, state=HIDDEN), **kwargs)
 
 
-def particle_filter(**kwargs) -> ParticleFilterModule:
+def particle_filter(**kwargs):
     return ParticleFilterModule(make_particles(OBS, ACTION), **kwargs)
 
 
@@ -51,7 +50,7 @@ EVERY = pytest.mark.parametrize("make_module", [gru, belief_filter, particle_fil
 
 
 @functools.cache
-def agent_and_rollout(make_module) -> tuple[Agent, TensorDictBase]:
+def agent_and_rollout(make_module):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         agent = make_agent(make_module(), HIDDEN, dtype=DTYPE)
@@ -108,7 +107,7 @@ BARE = {"in_keys": {"observed": None, "previous_action": None}}
 without_a_primer = pytest.mark.filterwarnings("ignore:.*make_tensordict_primer:UserWarning")
 
 
-def frames(*shape: int) -> TensorDict:
+def frames(*shape):
     value, is_init = torch.ones(*shape, OBS).cumsum(-2), torch.zeros(*shape, 1, dtype=torch.bool)
     return TensorDict({"observation": value, "is_init": is_init}, shape)
 

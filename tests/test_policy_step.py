@@ -18,7 +18,7 @@ from torchrl_drbpn.modules import MaskedObservationNorm
 OBS, ACTION, BATCH, TIME = 5, 2, 3, 12
 
 
-def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float64, **keys):
+def make(kind, policy_input="mean", dtype=torch.float64, **keys):
     """A belief module of one kind, and a head of one hidden layer."""
     belief = BeliefFilterModule(make_model(kind, dtype), policy_input=policy_input, **keys)
     torch.manual_seed(0)
@@ -26,7 +26,7 @@ def make(kind: str, policy_input: str = "mean", dtype: torch.dtype = torch.float
     return belief, nn.Sequential(layers[0], nn.Tanh(), layers[1])
 
 
-def first_step(belief: BeliefFilterModule):
+def first_step(belief):
     """The arguments of a PolicyStep at the first step of an episode."""
     observation, observed, is_init = (x[0] for x in inputs(OBS))
     action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
@@ -34,7 +34,7 @@ def first_step(belief: BeliefFilterModule):
     return [observation, observed, action, is_init, *state]
 
 
-def inputs(obs: int, dtype: torch.dtype = torch.float64, seed: int = 0):
+def inputs(obs, dtype=torch.float64, seed=0):
     """Per step: observation, mask, first step of an episode; one row restarts in the middle."""
     g = torch.Generator().manual_seed(seed)
     observation = torch.randn(TIME, BATCH, obs, generator=g, dtype=dtype)
@@ -46,7 +46,7 @@ def inputs(obs: int, dtype: torch.dtype = torch.float64, seed: int = 0):
     return observation, observed, is_init
 
 
-def run(step, belief: BeliefFilterModule):
+def run(step, belief):
     """Act through the steps; the state is put back to zero where an episode starts."""
     mean, age, *cov = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
     action, out = torch.zeros(BATCH, ACTION, dtype=mean.dtype), []
@@ -61,7 +61,7 @@ def run(step, belief: BeliefFilterModule):
     return torch.stack(out), age
 
 
-def through_keys(belief: BeliefFilterModule, head: nn.Module, norm: nn.Module | None = None):
+def through_keys(belief, head, norm=None):
     """A step like that of PolicyStep, by the modules and their keys."""
 
     @torch.no_grad()
@@ -207,7 +207,7 @@ def test_limits_clip_the_action_and_not_what_is_fed_back():
     belief, head = make("innovation")
 
     class LocScale(nn.Module):
-        def __init__(self) -> None:
+        def __init__(self):
             super().__init__()
             self.location = head
 

@@ -7,7 +7,7 @@ import oracles
 import pytest
 import torch
 from filter_problems import TOLERANCE, Problem, assert_equal, by_hand
-from torch import Tensor, nn
+from torch import nn
 
 from torchrl_drbpn import BeliefFilter, GaussianTransition
 from torchrl_drbpn.functional import (
@@ -20,7 +20,7 @@ from torchrl_drbpn.functional import (
 )
 
 
-def linear(system: oracles.LinearSystem) -> StateSpace:
+def linear(system):
     weight = torch.cat([system.dynamics, system.control], 1)
     f = TransitionMLP((weight,), (torch.zeros_like(system.initial_mean),), False, "relu")
     return StateSpace(
@@ -76,11 +76,11 @@ def test_what_a_propagated_covariance_needs_is_named():
 class Own(nn.Module):
     """A transition that is no GaussianTransition: s + .1 tanh(A s) a_1, with a constant Q."""
 
-    def __init__(self, state: int) -> None:
+    def __init__(self, state):
         super().__init__()
         self.matrix = nn.Parameter(torch.randn(state, state))
 
-    def forward(self, mean: Tensor, action: Tensor) -> Belief:
+    def forward(self, mean, action):
         moved = mean + 0.1 * (mean @ self.matrix.mT).tanh() * action[..., :1]
         return Belief(moved, 0.1 * torch.eye(mean.shape[-1]).to(mean).expand(*mean.shape, -1))
 
@@ -100,7 +100,7 @@ def test_the_closed_form_jacobian_is_that_of_autograd(hidden, activation, residu
     assert_equal(f.jacobian(mean, action, average=True), rows.mean((0, 1)), 1e-12)
 
 
-def inputs(batch: int = 4, time: int = 6, obs: int = 5) -> tuple[Tensor, ...]:
+def inputs(batch=4, time=6, obs=5):
     torch.manual_seed(1)
     seen = torch.rand(batch, time, obs) < 0.6
     reset = torch.zeros(batch, time, dtype=torch.bool)

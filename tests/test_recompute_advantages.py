@@ -9,7 +9,7 @@ from training.reward_scale import ReturnStatistics, scale_reward
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.5")
 
 
-def collected(*overrides: str):
+def collected(*overrides):
     from ppo_drbpn import collect
     from training.ppo import add_advantages
 
@@ -22,7 +22,7 @@ def collected(*overrides: str):
     return training, data
 
 
-def move_critic(training) -> None:
+def move_critic(training):
     with torch.no_grad():
         for parameter in training.agent.critic.parameters():
             parameter.add_(0.1)
@@ -58,7 +58,7 @@ def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
     assert not torch.allclose(data["advantage"], stale, atol=1e-3)
 
 
-def losses(recompute: bool, epochs: int) -> dict[str, float]:
+def losses(recompute, epochs):
     from ppo_drbpn import train_rollout
 
     with torch.random.fork_rng():
@@ -86,7 +86,7 @@ def test_a_belief_without_memory_learns_from_single_steps_and_the_last_of_a_roll
 GAMMA = 0.9
 
 
-def make_rollouts(count: int = 3, rows: int = 2, time: int = 15):
+def make_rollouts(count=3, rows=2, time=15):
     generator = torch.Generator().manual_seed(0)
     shape = (count, rows, time, 1)
     reward = 2 + 3 * torch.randn(shape, generator=generator, dtype=torch.float64)

@@ -5,13 +5,13 @@ A weight as a noise variance: test_functional_filtering.py.
 
 import math
 import statistics
-from typing import Any, get_args
+from typing import get_args
 
 import oracles
 import pytest
 import torch
 from filter_problems import by_hand, make_model
-from torch import Tensor, nn
+from torch import nn
 
 from torchrl_drbpn import (
     BeliefDivergedError,
@@ -28,18 +28,18 @@ MODELS = ["innovation", "information", "free", "full", "network", "propagated"]
 KINDS = list(get_args(Robust))
 
 
-def before(model: BeliefFilter) -> Tensor | None:
+def before(model):
     """Covariance of the step before the first, where it is read."""
     if model.covariance == "constant":
         return None
     return 0.4 * torch.eye(model.state_dim, dtype=torch.float64).expand(BATCH, -1, -1)
 
 
-def inputs(model: BeliefFilter, wrong: float = 0.25) -> tuple[Tensor, ...]:
+def inputs(model, wrong=0.25):
     """Sequences whose readings are off in a share; row 0 has none, row 1 one; two rows start."""
     g = torch.Generator().manual_seed(0)
 
-    def draw(*shape: int) -> Tensor:
+    def draw(*shape):
         return torch.randn(*shape, generator=g, dtype=torch.float64)
 
     mean, action = draw(BATCH, model.state_dim), draw(BATCH, TIME, ACTION)
@@ -53,12 +53,12 @@ def inputs(model: BeliefFilter, wrong: float = 0.25) -> tuple[Tensor, ...]:
     return mean, action, observation, observed, reset
 
 
-def first(data: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+def first(data):
     """One step of the sequences."""
     return data[0], *(x[:, 0] for x in data[1:])
 
 
-def textbook_weights(v: Tensor, S: Tensor, r: Tensor, seen: Tensor, kind: str, c: float) -> Tensor:
+def textbook_weights(v, S, r, seen, kind, c):
     """Weights of one vector of readings, each conditioned on the others, row by row."""
     rows = [i for i in range(len(v)) if seen[i]]
     marginal = {i: abs(float(v[i])) / math.sqrt(S[i, i]) for i in rows}
@@ -80,13 +80,11 @@ def textbook_weights(v: Tensor, S: Tensor, r: Tensor, seen: Tensor, kind: str, c
     return r / (r + held)
 
 
-def textbook(
-    model: BeliefFilter, kind: str, c: float, data: tuple[Tensor, ...]
-) -> tuple[oracles.Sequence, Tensor]:
+def textbook(model, kind, c, data):
     """Filter by loops over rows, steps and readings; the weights."""
     H, R, found = model.emission.matrix, model.emission.cov(), []
 
-    def noise(m: Tensor, P: Tensor, x: Tensor, seen: Tensor, offset: Tensor) -> Tensor:
+    def noise(m, P, x, seen, offset):
         with torch.no_grad():
             v = torch.where(seen, x - H @ m - offset, 0.0)
             w = textbook_weights(v, H @ P @ H.mT + R, R.diagonal(), seen, kind, c)
@@ -99,7 +97,7 @@ def textbook(
 
 @pytest.mark.parametrize("robust", KINDS)
 @pytest.mark.parametrize("kind", MODELS)
-def test_a_robust_filter_is_the_textbook_in_values_and_all_gradients(kind, robust) -> None:
+def test_a_robust_filter_is_the_textbook_in_values_and_all_gradients(kind, robust):
     model = make_model(kind, robust=robust, robust_threshold=2.0)
     data = inputs(model)
     mean, *rest = data
@@ -121,7 +119,7 @@ def test_a_robust_filter_is_the_textbook_in_values_and_all_gradients(kind, robus
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_readings_within_the_threshold_are_believed_to_the_bit(kind: str) -> None:
+def test_readings_within_the_threshold_are_believed_to_the_bit(kind):
     model, plain = make_model(kind, robust="huber", robust_threshold=1e3), make_model(kind)
     mean, *rest = inputs(model, wrong=0.0)
     options = {"cov": before(model), "robust": "huber", "threshold": 1e3}
@@ -133,9 +131,7 @@ def test_readings_within_the_threshold_are_believed_to_the_bit(kind: str) -> Non
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
 
 
-def correlated(
-    off: dict[int, float], robust: str | None, n: int = 5, c: float = 3.0
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def correlated(off, robust, n=5, c=3.0):
     """Weights, belief, and the mean of the right ones, of n sensors of one state.
 
     P = 1, R = .01, state .5; readings are spread evenly within a noise deviation.
@@ -155,7 +151,7 @@ def correlated(
 
 @pytest.mark.parametrize("robust", KINDS)
 @pytest.mark.parametrize("n", [1, 2, 5])
-def test_one_reading_moved_to_infinity_moves_the_mean_less_than_its_bound(n: int, robust) -> None:
+def test_one_reading_moved_to_infinity_moves_the_mean_less_than_its_bound(n, robust):
     """The bound: c deviations of the belief from the other readings, whatever their number.
 
     huber: as |v_i| grows the mean tends to that of the others plus P_i h c / sigma_i, with P_i and
@@ -174,7 +170,7 @@ def test_one_reading_moved_to_infinity_moves_the_mean_less_than_its_bound(n: int
 
 
 @pytest.mark.parametrize("robust", KINDS)
-def test_half_of_independent_sensors_wrong_at_once_is_withstood(robust: str) -> None:
+def test_half_of_independent_sensors_wrong_at_once_is_withstood(robust):
     """Six states, a sensor each, three of them off by 1e6: the belief stays within 4 deviations."""
     n = 6
     S, r = (1.0 + 0.01) * torch.eye(n).double(), torch.full((n,), 0.01).double()
@@ -190,7 +186,7 @@ def test_half_of_independent_sensors_wrong_at_once_is_withstood(robust: str) -> 
 
 
 @pytest.mark.parametrize("robust", KINDS)
-def test_where_all_readings_agree_on_another_state_the_belief_follows_them(robust: str) -> None:
+def test_where_all_readings_agree_on_another_state_the_belief_follows_them(robust):
     w, mean, *_ = correlated(dict.fromkeys(range(5), 1e4), robust)
     assert w.min() > 0.9
     assert mean > 9e3
@@ -207,7 +203,7 @@ def test_where_all_readings_agree_on_another_state_the_belief_follows_them(robus
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_a_policy_step_and_its_export_keep_the_robust_update(kind: str) -> None:
+def test_a_policy_step_and_its_export_keep_the_robust_update(kind):
     model = make_model(kind, robust="huber", robust_threshold=1.0)
     module = BeliefFilterModule(model, policy_input="mean_cov")
     step = PolicyStep(module, nn.Linear(module.feature_dim, ACTION, dtype=torch.float64))
@@ -225,11 +221,11 @@ def test_a_policy_step_and_its_export_keep_the_robust_update(kind: str) -> None:
         torch.testing.assert_close(exported(*args), step(*args))
 
 
-def test_float32_and_a_transition_of_your_own_have_the_weights_too() -> None:
+def test_float32_and_a_transition_of_your_own_have_the_weights_too():
     class Own(nn.Module):
         state_dim = OBS
 
-        def forward(self, mean: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        def forward(self, mean, action):
             del action
             return 0.9 * mean, torch.eye(OBS, dtype=mean.dtype).expand(*mean.shape, OBS)
 
@@ -254,7 +250,7 @@ def test_float32_and_a_transition_of_your_own_have_the_weights_too() -> None:
         ("infinite", ValueError, "`observation` holds infinite readings"),
     ],
 )
-def test_an_error_names_its_cause_whatever_the_update(spoiled, error, message, robust) -> None:
+def test_an_error_names_its_cause_whatever_the_update(spoiled, error, message, robust):
     model = make_model("innovation", robust=robust)
     mean, action, observation, observed, reset = first(inputs(model))
     # a mean or an action is named where nothing was observed too: the likelihood is 0 then
@@ -283,7 +279,7 @@ def test_an_error_names_its_cause_whatever_the_update(spoiled, error, message, r
         ),
     ],
 )
-def test_an_update_that_is_none_is_refused(options: dict[str, Any], message: str) -> None:
+def test_an_update_that_is_none_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         BeliefFilter(OBS, ACTION, **options)
     model = make_model("innovation", robust="huber")

@@ -3,7 +3,6 @@
 import oracles
 import pytest
 import torch
-from torch import Tensor
 
 from torchrl_drbpn import functional, select_sensors
 from torchrl_drbpn.functional import Belief
@@ -12,7 +11,7 @@ DOUBLE = torch.float64
 EYE = torch.eye(3)
 
 
-def posterior(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> Tensor:
+def posterior(H, P, R, rows):
     """P+ in information form, P^-1 + H_S' R_SS^-1 H_S inverted: rows deleted, nothing masked."""
     if not rows:
         return P
@@ -20,18 +19,18 @@ def posterior(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> Tensor:
     return torch.linalg.inv(torch.linalg.inv(P) + Hs.T @ torch.linalg.solve(Rs, Hs))
 
 
-def information(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> float:
+def information(H, P, R, rows):
     """I(s; x_S) = 1/2 log det(I + R_SS^-1 H_S P H_S'), nats."""
     Hs, Rs = H[rows], R[rows][:, rows]
     inner = torch.eye(len(rows), dtype=DOUBLE) + torch.linalg.solve(Rs, Hs @ P @ Hs.T)
     return 0.5 * float(torch.linalg.slogdet(inner).logabsdet)
 
 
-def criterion_value(criterion: str, cov: Tensor) -> float:
+def criterion_value(criterion, cov):
     return float(torch.linalg.slogdet(cov).logabsdet if criterion == "D" else cov.trace())
 
 
-def problem(seed: int, obs: int = 7, state: int = 4, full: bool = False):
+def problem(seed, obs=7, state=4, full=False):
     """A random sensor model: H, P full, R diagonal or full."""
     g = torch.Generator().manual_seed(seed)
     H = torch.randn(obs, state, generator=g, dtype=DOUBLE)
@@ -39,7 +38,7 @@ def problem(seed: int, obs: int = 7, state: int = 4, full: bool = False):
     return H, oracles.spd(state, g), R
 
 
-def updated(H: Tensor, P: Tensor, R: Tensor, rows: list[int]) -> Tensor:
+def updated(H, P, R, rows):
     """The covariance that the library's own update leaves with these rows observed."""
     observed = torch.zeros(len(H), dtype=torch.bool)
     observed[rows] = True

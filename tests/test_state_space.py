@@ -14,7 +14,7 @@ F64 = torch.float64
 COVS = list(itertools.product(("diag", "full"), (False, True)))
 
 
-def inputs(batch: tuple[int, ...] = (7,), seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def inputs(batch=(7,), seed=0):
     g = torch.Generator().manual_seed(seed)
     return (
         torch.randn(*batch, STATE, generator=g, dtype=F64),
@@ -22,14 +22,14 @@ def inputs(batch: tuple[int, ...] = (7,), seed: int = 0) -> tuple[torch.Tensor, 
     )
 
 
-def scramble(module: torch.nn.Module, scale: float, seed: int = 0) -> None:
+def scramble(module, scale, seed=0):
     g = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.copy_(scale * torch.randn(parameter.shape, generator=g, dtype=F64))
 
 
-def assert_covariance(matrix: torch.Tensor, floor: float, cov: str) -> None:
+def assert_covariance(matrix, floor, cov):
     eigenvalues = torch.linalg.eigvalsh(matrix)
     assert torch.equal(matrix, matrix.mT)
     assert (eigenvalues >= floor**2 - 1e-12 * eigenvalues[..., -1:]).all()
@@ -132,7 +132,7 @@ def test_a_fixed_matrix_is_saved_but_not_learned():
     ids=["network Q", "free Q", "emission"],
 )
 def test_reset_parameters_go_back_to_the_start(module):
-    def noise() -> torch.Tensor:
+    def noise():
         if isinstance(module, LinearGaussianEmission):
             return module.cov()
         return module.cov(torch.ones(STATE), torch.ones(ACTION))

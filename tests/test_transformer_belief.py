@@ -7,14 +7,13 @@ import pytest
 import torch
 from belief_frames import BeliefFrames
 from contract_environments import ACTION, OBS
-from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import nn
 from torchrl.modules import set_recurrent_mode
 
 MEMORY, LENGTH = ("recurrent", "memory"), ("recurrent", "length")
 
 
-def make_module(**sizes: int):
+def make_module(**sizes):
     """Return a transformer in float64."""
     from training.config import build, choice
 
@@ -30,12 +29,12 @@ class Frames(BeliefFrames):
     observation = "normalized_observation"
 
 
-def make_frames(batch: int, time: int) -> TensorDict:
+def make_frames(batch, time):
     """Return what arrived over some steps of an episode that goes on."""
     return Frames().make_frames((batch, time), torch.float64, obs=OBS)
 
 
-def reach(module, frames: TensorDict) -> Tensor:
+def reach(module, frames):
     """Return whether the features of a step (row) move with what arrived at another (column)."""
     frames = frames.clone()
     observation = frames["normalized_observation"].requires_grad_()
@@ -49,13 +48,13 @@ def reach(module, frames: TensorDict) -> Tensor:
     return torch.stack([(row != 0).any(-1).any(0) for row in rows])
 
 
-def in_steps(module, frames: TensorDict) -> TensorDict:
+def in_steps(module, frames):
     """Run one step at a time from an empty memory."""
     with torch.no_grad():
         return Frames().one_by_one(module, frames, None)
 
 
-def band(time: int, steps: int) -> Tensor:
+def band(time, steps):
     """Return whether a step (row) comes after another (column), by at most that many steps."""
     distance = torch.arange(time).unsqueeze(1) - torch.arange(time)
     return (distance >= 0) & (distance <= steps)

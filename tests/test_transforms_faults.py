@@ -285,7 +285,7 @@ def test_masks_follow_the_chain_and_every_episode_has_its_own_start(initial):
     rollout = env.rollout(9, break_when_any_done=False)
     assert rollout["next", "done"].any(1).all()
 
-    def start() -> torch.Tensor:
+    def start():
         if initial == "on":
             return torch.ones(3, OBS, dtype=torch.bool)
         return sample_working(None, rates, like, generator)

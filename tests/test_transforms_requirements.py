@@ -4,35 +4,34 @@ import copy
 import math
 import pickle
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
 from contracts import ACTION, OBS, StaircaseEnv, gym_env, parallel_env, saved, with_transform
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
-from transform_cases import CASES, COMPLETE, Case
+from transform_cases import CASES, COMPLETE
 
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 OBSERVING = {name: case for name, case in CASES.items() if name != "previous_action"}
 of_observations = pytest.mark.parametrize("case", OBSERVING.values(), ids=OBSERVING)
 
 
-def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
+def assert_same(first, second):
     assert set(first.keys(True, True)) == set(second.keys(True, True))
     for key in first.keys(True, True):
         torch.testing.assert_close(first[key], second[key], rtol=0, atol=0, equal_nan=True)
 
 
-def simulator() -> TransformedEnv:
+def simulator():
     return gym_env("InvertedPendulum-v5")
 
 
-def corrupted_simulator(case: Case) -> TransformedEnv:
+def corrupted_simulator(case):
     env = simulator()
     for make in (*case.needs, case.make):
         env = with_transform(lambda env=env: env, make)
@@ -41,7 +40,7 @@ def corrupted_simulator(case: Case) -> TransformedEnv:
 
 @every
 @pytest.mark.parametrize("batched", [False, True])
-def test_specs_are_met_in_one_environment(case: Case, batched: bool) -> None:
+def test_specs_are_met_in_one_environment(case, batched):
     env = case.env(StaircaseEnv()) if batched else corrupted_simulator(case)
     check_env_specs(env, break_when_any_done="both")
     reset = env.reset()
@@ -60,7 +59,7 @@ def test_specs_are_met_in_one_environment(case: Case, batched: bool) -> None:
     [SerialEnv, pytest.param(parallel_env, marks=pytest.mark.slow)],
     ids=["serial", "parallel"],
 )
-def test_specs_are_met_in_workers_and_outside_of_them(case: Case, workers: Any, where: str) -> None:
+def test_specs_are_met_in_workers_and_outside_of_them(case, workers, where):
     if where == "inside":
         env = workers(2, partial(corrupted_simulator, case))
     else:
@@ -73,7 +72,7 @@ def test_specs_are_met_in_workers_and_outside_of_them(case: Case, workers: Any, 
 
 @every
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3), (4096,)], ids=str)
-def test_any_number_of_rows_is_treated_at_once(case: Case, batch: tuple[int, ...]) -> None:
+def test_any_number_of_rows_is_treated_at_once(case, batch):
     data = case.data(batch)
     if "previous_action" not in case.keys:
         first = case.make()._reset(data.empty(), data.clone())
@@ -87,7 +86,7 @@ def test_any_number_of_rows_is_treated_at_once(case: Case, batch: tuple[int, ...
 
 
 @every
-def test_the_state_of_the_next_step_needs_no_number_of_this_one(case: Case) -> None:
+def test_the_state_of_the_next_step_needs_no_number_of_this_one(case):
     # the meta device has shapes and dtypes, and raises where a value is asked for
     data, root = (part.to("meta") for part in (case.data((3,)), case.root((3,))))
     expected = case.make()._step(case.root((3,)), case.data((3,)))
@@ -98,7 +97,7 @@ def test_the_state_of_the_next_step_needs_no_number_of_this_one(case: Case) -> N
 
 
 @every
-def test_a_replay_buffer_is_served_or_refused_with_nothing_left_in_it(case: Case) -> None:
+def test_a_replay_buffer_is_served_or_refused_with_nothing_left_in_it(case):
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=4)
     transform, data = case.make(), case.data((6,)).set("action", torch.zeros(6, ACTION))
     buffer.append_transform(transform)
@@ -116,7 +115,7 @@ def test_a_replay_buffer_is_served_or_refused_with_nothing_left_in_it(case: Case
 
 
 @every
-def test_in_front_of_a_model_it_works_or_is_refused(case: Case) -> None:
+def test_in_front_of_a_model_it_works_or_is_refused(case):
     module = TensorDictModule(nn.Linear(OBS, 1), ["observation"], ["value"])
     data, transform = case.data((3,)), case.make()
     if not case.offline:
@@ -129,7 +128,7 @@ def test_in_front_of_a_model_it_works_or_is_refused(case: Case) -> None:
 
 
 @pytest.mark.parametrize("name", ["reduction", "nan"])
-def test_keys_under_next_are_a_vector_of_their_own(name: str) -> None:
+def test_keys_under_next_are_a_vector_of_their_own(name):
     case = CASES[name]
     more = {} if name == "nan" else {"complete_key": [COMPLETE, ("next", COMPLETE)]}
     transform = case.make(in_keys=["observation", ("next", "observation")], **more)
@@ -140,7 +139,7 @@ def test_keys_under_next_are_a_vector_of_their_own(name: str) -> None:
 
 
 @every
-def test_float64_is_kept(case: Case) -> None:
+def test_float64_is_kept(case):
     after = case.make()._step(case.root((3,), torch.float64), case.data((3,), torch.float64))
     for key in case.keys:
         assert after[key].dtype == torch.float64
@@ -148,7 +147,7 @@ def test_float64_is_kept(case: Case) -> None:
 
 @every
 @pytest.mark.parametrize("batch", [3, 4096])
-def test_a_partial_reset_leaves_the_other_rows_alone(case: Case, batch: int) -> None:
+def test_a_partial_reset_leaves_the_other_rows_alone(case, batch):
     env = case.env(StaircaseEnv(batch=batch, dtype=torch.float64))
     root = env.rand_step(env.reset())["next"].exclude("reward")
     rows = torch.arange(batch) % 2 == 0
@@ -159,7 +158,7 @@ def test_a_partial_reset_leaves_the_other_rows_alone(case: Case, batch: int) -> 
 
 
 @every
-def test_rollouts_pass_over_the_ends_of_episodes(case: Case) -> None:
+def test_rollouts_pass_over_the_ends_of_episodes(case):
     env = case.env(StaircaseEnv())
     data = env.rollout(12, break_when_any_done=False)
     assert data["next", "done"].any()
@@ -170,7 +169,7 @@ def test_rollouts_pass_over_the_ends_of_episodes(case: Case) -> None:
 
 
 @every
-def test_a_saved_state_goes_on_as_if_never_stopped(case: Case) -> None:
+def test_a_saved_state_goes_on_as_if_never_stopped(case):
     data, root = case.data((3,)), case.root((3,))
     first, second = case.make(), case.make()
     first._step(root, data.clone())
@@ -184,7 +183,7 @@ def test_a_saved_state_goes_on_as_if_never_stopped(case: Case) -> None:
     [lambda t: t.clone(), copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))],
     ids=["clone", "deepcopy", "pickle"],
 )
-def test_a_copy_goes_its_own_way_from_the_same_state(case: Case, duplicate: Any) -> None:
+def test_a_copy_goes_its_own_way_from_the_same_state(case, duplicate):
     data, root = case.data((3,)), case.root((3,))
     first = case.make()
     first._step(root, data.clone())
@@ -196,7 +195,7 @@ def test_a_copy_goes_its_own_way_from_the_same_state(case: Case, duplicate: Any)
 
 
 @every
-def test_with_a_seed_the_global_generator_is_neither_read_nor_advanced(case: Case) -> None:
+def test_with_a_seed_the_global_generator_is_neither_read_nor_advanced(case):
     data, root, results = case.data((3,)), case.root((3,)), []
     for seed in (1, 2):
         torch.manual_seed(seed)
@@ -207,7 +206,7 @@ def test_with_a_seed_the_global_generator_is_neither_read_nor_advanced(case: Cas
 
 
 @of_observations
-def test_a_mask_that_is_there_is_anded(case: Case) -> None:
+def test_a_mask_that_is_there_is_anded(case):
     data, root = case.data((4,)), case.root((4,))
     hidden = torch.zeros(4, OBS, dtype=torch.bool)
     hidden[:, 2] = True
@@ -222,7 +221,7 @@ def test_a_mask_that_is_there_is_anded(case: Case) -> None:
 
 
 @of_observations
-def test_an_absent_observation_is_named(case: Case) -> None:
+def test_an_absent_observation_is_named(case):
     transform = case.make()
     with pytest.raises(KeyError, match=rf"`{type(transform).__name__}` reads 'observation', which"):
         transform._step(case.root((3,)), TensorDict({}, [3]))
@@ -242,9 +241,7 @@ def test_an_absent_observation_is_named(case: Case) -> None:
     ],
     ids=["integer", "bool", "mask of another shape", "mask of numbers"],
 )  # fmt: skip
-def test_entries_of_wrong_dtype_or_shape_are_refused(
-    case: Case, key: str, change: Any, message: str
-) -> None:
+def test_entries_of_wrong_dtype_or_shape_are_refused(case, key, change, message):
     data = case.data((4,))
     data[key] = change(data["observation"])
     with pytest.raises(ValueError, match=message):
@@ -252,7 +249,7 @@ def test_entries_of_wrong_dtype_or_shape_are_refused(
 
 
 @of_observations
-def test_what_lies_under_a_false_mask_is_never_read(case: Case) -> None:
+def test_what_lies_under_a_false_mask_is_never_read(case):
     results = []
     for junk in (0.0, math.nan, math.inf, 1e30):
         data = case.data((4,))
@@ -268,7 +265,7 @@ def test_what_lies_under_a_false_mask_is_never_read(case: Case) -> None:
 
 
 @every
-def test_keys_must_come_in_pairs(case: Case) -> None:
+def test_keys_must_come_in_pairs(case):
     if "previous_action" in case.keys:
         with pytest.raises(ValueError, match="`out_keys` must name one key of its own"):
             case.make("action", ["a", "b"])

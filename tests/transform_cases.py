@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import torch
 from contracts import ACTION, OBS
@@ -30,13 +29,13 @@ COMPLETE = "complete_observation"
 Check = Callable[[TensorDictBase, TensorDictBase], None]
 
 
-def complete(before: TensorDictBase, after: TensorDictBase) -> None:
+def complete(before, after):
     """The complete observation is what came."""
     if COMPLETE in after and "observation" in before:
         assert torch.equal(after[COMPLETE], before["observation"])
 
 
-def masked(before: TensorDictBase, after: TensorDictBase) -> None:
+def masked(before, after):
     """What is missing is 0 and False in the mask, the rest is what came."""
     observation, observed = after["observation"], after["observed"]
     assert observed.dtype == torch.bool
@@ -45,19 +44,19 @@ def masked(before: TensorDictBase, after: TensorDictBase) -> None:
     complete(before, after)
 
 
-def reduced(before: TensorDictBase, after: TensorDictBase) -> None:
+def reduced(before, after):
     masked(before, after)
     assert not after["observed"][..., [0, -1]].any()
     assert after["observed"][..., 1:-1].all()
 
 
-def from_nan(before: TensorDictBase, after: TensorDictBase) -> None:
+def from_nan(before, after):
     masked(before, after)
     if "observation" in before:
         assert torch.equal(after["observed"], ~before["observation"].isnan())
 
 
-def noisy(before: TensorDictBase, after: TensorDictBase) -> None:
+def noisy(before, after):
     noise = after["observation"] - after[COMPLETE]
     assert "observed" not in after
     assert (noise != 0).all()
@@ -65,13 +64,13 @@ def noisy(before: TensorDictBase, after: TensorDictBase) -> None:
     complete(before, after)
 
 
-def spiked(before: TensorDictBase, after: TensorDictBase) -> None:
+def spiked(before, after):
     assert "observed" not in after
     assert torch.equal(after["observation"] == after[COMPLETE], ~after["spiked"])
     complete(before, after)
 
 
-def grouped(before: TensorDictBase, after: TensorDictBase) -> None:
+def grouped(before, after):
     masked(before, after)
     on, observed = after["sensor_on"], after["observed"]
     assert on.shape[-1] == 2
@@ -80,7 +79,7 @@ def grouped(before: TensorDictBase, after: TensorDictBase) -> None:
     assert observed[..., 2:-1].all()
 
 
-def delayed(before: TensorDictBase, after: TensorDictBase) -> None:
+def delayed(before, after):
     observation, observed = after["observation"], after["observed"]
     assert (observation[~observed] == 0).all()
     assert after["delayed_observation"].shape == (*observation.shape[:-1], 2, observation.shape[-1])
@@ -89,7 +88,7 @@ def delayed(before: TensorDictBase, after: TensorDictBase) -> None:
     complete(before, after)
 
 
-def stuck(before: TensorDictBase, after: TensorDictBase) -> None:
+def stuck(before, after):
     works = after["stuck_steps"] <= 0
     assert "observed" not in after
     assert torch.equal(after["observation"], after["stuck_observation"])
@@ -97,7 +96,7 @@ def stuck(before: TensorDictBase, after: TensorDictBase) -> None:
     complete(before, after)
 
 
-def drifting(before: TensorDictBase, after: TensorDictBase) -> None:
+def drifting(before, after):
     assert "observed" not in after
     assert torch.equal(after["observation"], after[COMPLETE] + after["drift_bias"])
     assert torch.equal(after["drift_bias"][..., [0, -1]] != 0, after["drift_steps"] > 0)
@@ -105,7 +104,7 @@ def drifting(before: TensorDictBase, after: TensorDictBase) -> None:
     complete(before, after)
 
 
-def filled(before: TensorDictBase, after: TensorDictBase) -> None:
+def filled(before, after):
     values, observed = after["observation"], after["observed"]
     assert torch.equal(values, after["last_observation"])
     if "observation" in before:
@@ -113,7 +112,7 @@ def filled(before: TensorDictBase, after: TensorDictBase) -> None:
         assert torch.equal(values[observed], before["observation"][observed])
 
 
-def previous(before: TensorDictBase, after: TensorDictBase) -> None:
+def previous(before, after):
     del before
     assert after["previous_action"].shape[:-1] == after.batch_size
     assert after["previous_action"].isfinite().all()
@@ -140,7 +139,7 @@ class Case:
     needs: list[Callable[..., Transform]] = field(default_factory=list)
     keys: tuple[str, ...] = ("observation",)
 
-    def data(self, batch: tuple[int, ...], dtype: torch.dtype = torch.float32) -> TensorDict:
+    def data(self, batch, dtype=torch.float32):
         """Return what an environment's step would give to the transform."""
         generator = torch.Generator().manual_seed(1)
         made = torch.randn(*batch, OBS, generator=generator, dtype=dtype)
@@ -152,7 +151,7 @@ class Case:
             data["observation"] = made.where(data["observed"], 0.0)
         return data
 
-    def root(self, batch: tuple[int, ...], dtype: torch.dtype = torch.float32) -> TensorDict:
+    def root(self, batch, dtype=torch.float32):
         """Return the data at the step before, with the action that led to `data`."""
         data = self.data(batch, dtype)
         data["action"] = torch.full((*batch, ACTION), 0.5, dtype=dtype)
@@ -161,7 +160,7 @@ class Case:
             return reset
         return self.make()._reset(data.empty(), reset)
 
-    def env(self, base: Any) -> TransformedEnv:
+    def env(self, base):
         return TransformedEnv(base, Compose(*(make() for make in self.needs), self.make()))
 
 
