@@ -28,14 +28,13 @@ SPIKES = partial(ObservationSpikes, 0.1, 5.0)
 
 
 def test_specs_say_what_is_written():
-    env = staircase(SPIKES(complete_key=COMPLETE, spiked_key="hit"), MISSING())
+    env = staircase(SPIKES(complete_key=COMPLETE), MISSING())
     bounded = StaircaseEnv().observation_spec["observation"]
     spec = env.observation_spec
     assert isinstance(spec["observation"], Unbounded)
-    for mask in ("observed", "hit"):
-        assert isinstance(spec[mask], Binary)
-        assert spec[mask].dtype == torch.bool
-        assert spec[mask].shape == spec["observation"].shape == bounded.shape
+    assert isinstance(spec["observed"], Binary)
+    assert spec["observed"].dtype == torch.bool
+    assert spec["observed"].shape == spec["observation"].shape == bounded.shape
     assert spec[COMPLETE] == bounded
 
 
@@ -59,11 +58,10 @@ def test_numbers_per_component_span_several_keys():
     assert (after["a"] == 0).all()
     assert ((after["b"] != 0) == torch.tensor([False, True, False])).all()
     assert torch.equal(after["ca"], both["a"])
-    spikes = ObservationSpikes([0, 1, 0, 1, 0], [1, 1, 1, 100, 1], spiked_key=["ha", "hb"], **keys)
+    spikes = ObservationSpikes([0, 1, 0, 1, 0], [1, 1, 1, 100, 1], **keys)
     after = spikes._call(both)
     assert ((after["a"] != 0) == torch.tensor([False, True])).all()
-    assert torch.equal(after["ha"], after["a"] != 0)
-    assert torch.equal(after["hb"], after["b"] != 0)
+    assert ((after["b"] != 0) == torch.tensor([False, True, False])).all()
     assert after["b"][:, 1].std() > 50 > 5 > after["a"][:, 1].std()
 
 
@@ -74,13 +72,12 @@ def existing_mask():
 
 
 @pytest.mark.parametrize(
-    "transform", [ObservationNoise(1.0), ObservationSpikes(1.0, 5.0, spiked_key="hit")], ids=type
+    "transform", [ObservationNoise(1.0), ObservationSpikes(1.0, 5.0)], ids=type
 )
 def test_missing_entries_are_neither_changed_nor_filled(transform):
     after = transform._call(data(0.0, observed=existing_mask()))
     assert torch.equal(after["observation"] != 0, existing_mask())
     assert torch.equal(after["observed"], existing_mask())
-    assert torch.equal(after.get("hit", existing_mask()), existing_mask())
 
 
 def test_infinite_values_are_errors_and_not_gaps():
@@ -244,9 +241,8 @@ def use_spec(transform, shape, dtype=torch.float32):
           for m in ([5], [-6], [True, False])],
         (lambda: staircase(SensorReduction([5])).observation_spec, ValueError, "`missing` "),
         (lambda: ObservationSpikes(1.1, 1.0), ValueError, "`probability` must .* got 1.1"),
-        (lambda: SPIKES(spiked_key="observed"), ValueError, "`spiked_key` must name keys of"),
-        (lambda: staircase(SPIKES(spiked_key="hit"), SPIKES(spiked_key="hit")).reset(), ValueError,
-         "`hit` is among the observations"),
+        (lambda: staircase(NOISE(complete_key="observation")).reset(), ValueError,
+         "`observation` is among the observations"),
         (lambda: ObservationMissingness("random", 0.5), ValueError,
          r"`mechanism` must be one of .*'mcar'.* got 'random'"),
         *[(lambda s=s: MAR(always_observed=s), ValueError,

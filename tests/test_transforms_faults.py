@@ -244,7 +244,7 @@ def test_a_state_that_got_lost_or_is_another_is_named():
           for g in ([], [[]], [0, 1], [["a"]], [[True]], "legs")],
         (lambda: SensorOutages(0.9, 2), "`mean_length` must be at least eta"),
         (lambda: SensorOutages(0.5, 5, initial="off"), "`initial` must be one of .* got 'off'"),
-        (lambda: SensorOutages(0.5, 5, state_key="observed"), "`state_key` must be a key of its o"),
+        (lambda: SensorOutages(0.5, 5, state_keys="observed"), "`state_keys` must be a key of"),
     ],
 )  # fmt: skip
 def test_what_no_sensor_does_is_refused_in_one_line(make, line):
@@ -311,7 +311,7 @@ def test_writing_into_the_mask_does_not_repair_a_sensor():
 def test_several_keys_are_one_vector_and_groups_reach_over_them():
     both = TensorDict({"a": torch.ones(400, 2), "b": torch.ones(400, 3)}, [400])
     outages = SensorOutages(
-        0.5, 5, groups=[[0, 2], [-1]], in_keys=["a", "b"], mask_keys=["ma", "mb"], state_key="on"
+        0.5, 5, groups=[[0, 2], [-1]], in_keys=["a", "b"], mask_keys=["ma", "mb"], state_keys="on"
     )
     after = outages._call(both)
     assert torch.equal(after["ma"][:, 0], after["on"][:, 0])
@@ -336,7 +336,7 @@ def test_two_of_them_need_two_states():
         _ = staircase(SensorOutages(0.2, 5), SensorOutages(0.2, 20)).observation_spec
     env = staircase(
         SensorOutages(0.2, 5),
-        SensorOutages(0.2, 20, groups=[[0, 1, 2, 3, 4]], state_key="bus_on"),
+        SensorOutages(0.2, 20, groups=[[0, 1, 2, 3, 4]], state_keys="bus_on"),
         batch=500,
         horizon=20,
     )

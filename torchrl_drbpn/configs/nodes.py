@@ -1,32 +1,15 @@
 """One node of Hydra's ConfigStore for each class, its fields read from the constructor."""
 
-from __future__ import annotations
-
 import inspect
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import field, make_dataclass
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from torchrl_drbpn import modules, objectives, transforms
 
-__all__ = ["make_ppo_trainer", "register"]
-
 _NODES: dict[str, tuple[Any, ...]] = {
-    "transform": (
-        transforms.FillLastObserved,
-        transforms.ObservationDelay,
-        transforms.ObservationMissingness,
-        transforms.ObservationMultiRate,
-        transforms.ObservationNoise,
-        transforms.ObservationSpikes,
-        transforms.ObservedFromNaN,
-        transforms.PreviousAction,
-        transforms.SensorDrift,
-        transforms.SensorOutages,
-        transforms.SensorReduction,
-        transforms.StuckSensors,
-    ),
+    "transform": tuple(getattr(transforms, n) for n in transforms.__all__ if n != "seed_env"),
     "network": (
         modules.BeliefFilter,
         modules.GaussianTransition,
@@ -38,7 +21,7 @@ _NODES: dict[str, tuple[Any, ...]] = {
         modules.MaskedObservationNorm,
         modules.ParticleFilterModule,
     ),
-    "loss": (objectives.BeliefModelLoss, objectives.DRBPNLoss),
+    "loss": tuple(getattr(objectives, name) for name in objectives.__all__),
 }
 
 
@@ -104,35 +87,24 @@ def _snake(name: str) -> str:
 
 
 def _node(cls: Any, base: type) -> type:
+    # Hydra's own lists are lists then, as the constructors expect.
+    given = {"_target_": f"{cls.__module__}.{cls.__qualname__}", "_convert_": "all"}
     fields: list[Any] = [
         (name, Any, field(default="???" if default is inspect.Parameter.empty else default))
-        for name, default in _arguments(cls)
-    ]
-    # Hydra's own lists are lists then, as the constructors expect.
-    fields += [
-        ("_target_", str, field(default=f"{cls.__module__}.{cls.__qualname__}")),
-        ("_convert_", str, field(default="all")),
+        for name, default in (_arguments(cls) | given).items()
     ]
     return make_dataclass(
         f"{cls.__name__}Config", fields, bases=(base,), namespace={"__post_init__": lambda _: None}
     )
 
 
-def _arguments(cls: Any) -> Iterator[tuple[str, Any]]:
-    """Yield each argument of a constructor and its default, those that it passes on included."""
-    for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:
-        if parameter.kind is not parameter.VAR_KEYWORD:
-            yield name, parameter.default
-            continue
-        for passed_on in get_args(get_type_hints(cls.__init__)[name]):
-            yield from ((key, _default(cls, key)) for key in get_type_hints(passed_on))
-
-
-def _default(cls: Any, argument: str) -> Any:
-    """Return the default of an argument that a constructor passes on to a parent."""
+def _arguments(cls: Any) -> dict[str, Any]:
+    """Return a constructor's arguments and defaults, those that it passes on included."""
+    found: dict[str, Any] = {}
     for parent in cls.__mro__:
         if "__init__" in vars(parent):
-            parameter = inspect.signature(parent.__init__).parameters.get(argument)
-            if parameter is not None:
-                return parameter.default
-    raise TypeError(f"no parent of {cls.__name__} takes `{argument}`.")
+            own = list(inspect.signature(parent.__init__).parameters.values())[1:]
+            found = {p.name: p.default for p in own if p.kind is not p.VAR_KEYWORD} | found
+            if all(p.kind is not p.VAR_KEYWORD for p in own):
+                break
+    return found

@@ -5,8 +5,6 @@ simulator is stepped, and calls an episode that terminates on the last step of t
 truncated. Both are avoided: its own limit is out of reach and finished rows are reset by number.
 """
 
-from __future__ import annotations
-
 import difflib
 from typing import Any
 

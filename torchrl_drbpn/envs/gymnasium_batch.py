@@ -1,7 +1,5 @@
 """Many Gymnasium environments as one TorchRL environment, one TensorDict a step."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -6,8 +6,6 @@ after ``mj_step`` the body positions are those from before the last integration,
 Humanoid take their velocities from them.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Iterator, MutableSequence, Sequence

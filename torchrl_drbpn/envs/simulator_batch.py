@@ -3,8 +3,6 @@
 A batch pays TorchRL's per-step Python once for all of its simulators.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple, NoReturn

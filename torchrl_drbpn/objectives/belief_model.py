@@ -1,7 +1,5 @@
 """The likelihood of the learned model as a TorchRL loss."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 

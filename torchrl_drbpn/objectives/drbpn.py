@@ -1,10 +1,8 @@
 """DRBPN's loss: PPO on beliefs plus the model's likelihood, from one filter pass."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
@@ -22,10 +20,10 @@ from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, in_next
 def _held(name: str) -> Any:
     """Pass a coefficient on to the held PPO loss, which copies a number into its buffer."""
 
-    def read(self: DRBPNLoss) -> Any:
+    def read(self: Any) -> Any:
         return getattr(self.ppo_loss, name)
 
-    def write(self: DRBPNLoss, value: Any) -> None:
+    def write(self: Any, value: Any) -> None:
         setattr(self.ppo_loss, name, value.item() if isinstance(value, Tensor) else value)
 
     return property(read, write, doc=f"``{name}`` of the held PPO loss.")
@@ -228,7 +226,7 @@ class DRBPNLoss(LossModule):
 
     def make_value_estimator(
         self, value_type: ValueEstimators | None = None, **hyperparams: Any
-    ) -> DRBPNLoss:
+    ) -> Self:
         """Build TorchRL's estimator of advantages, GAE by default, over ``critic_network``."""
         if isinstance(value_type or self.default_value_estimator, ValueEstimators):
             hyperparams = {"deactivate_vmap": True, **hyperparams}

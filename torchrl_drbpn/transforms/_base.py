@@ -1,7 +1,5 @@
 """What the transforms share: keys, numbers, specs, order, and the frame of those that corrupt."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -288,8 +286,8 @@ class CorruptingTransform(Transform, ABC):
             ]
             step = Step(_join(parts), _join(masks), before, tensordict)
             corrupted, observed = self._corrupt(step)
-            arrived = split_like(zero_missing(corrupted, observed), parts)
-            written = zip(vector, parts, arrived, split_like(observed, parts), strict=True)
+            arrived = _split_like(zero_missing(corrupted, observed), parts)
+            written = zip(vector, parts, arrived, _split_like(observed, parts), strict=True)
             for (key, mask_key, complete_key), part, value, mask in written:
                 tensordict.set(key, value)
                 if self.writes_mask:
@@ -352,7 +350,7 @@ def _join(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
 
-def split_like(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
+def _split_like(joined: Tensor, parts: Sequence[Tensor]) -> Sequence[Tensor]:
     """Cut one vector into pieces as wide as `parts`."""
     sizes = [part.shape[-1] for part in parts]
     return [joined] if len(parts) == 1 else torch.split(joined, sizes, -1)

@@ -1,7 +1,5 @@
 """What transforms with a memory share: a state in the tensordict, and sensors that go together."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from numbers import Integral
@@ -41,8 +39,6 @@ class CarriedStateTransform(SeededTransform):
     """
 
     state_names: ClassVar[tuple[str, ...]]
-    # what errors call the argument that names the states
-    state_argument: ClassVar[str] = "state_keys"
     # attributes that hold one number for all groups, or one for each
     per_group: ClassVar[tuple[str, ...]] = ()
 
@@ -62,7 +58,7 @@ class CarriedStateTransform(SeededTransform):
         if not len(self.state_keys) == len(taken) == wanted or not taken.isdisjoint(self.out_keys):
             number = "a key" if wanted == 1 else f"{wanted} keys"
             raise ValueError(
-                f"`{self.state_argument}` must be {number} of its own, got {self.state_keys} "
+                f"`state_keys` must be {number} of its own, got {self.state_keys} "
                 f"beside {self.out_keys}, which this transform writes something else to."
             )
         self.out_keys = [*self.out_keys, *self.state_keys]
@@ -132,7 +128,7 @@ class CarriedStateTransform(SeededTransform):
                 raise ValueError(
                     f"`{key}` must be {_name(dtype)} of shape {tuple(shape)}, the state of "
                     f"`{type(self).__name__}`, got {_name(state.dtype)} {tuple(state.shape)}. Is "
-                    f"it the state of another transform? Pass {self.state_argument}=... ."
+                    f"it the state of another transform? Pass state_keys=... ."
                 )
             states.append(state)
         return states

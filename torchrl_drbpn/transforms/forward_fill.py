@@ -1,7 +1,5 @@
 """Fill missing entries with the last value that was observed."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch

@@ -1,7 +1,5 @@
 """Entries that do not arrive: at random, by design, or as NaN from real sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from numbers import Real

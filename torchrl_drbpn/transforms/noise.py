@@ -1,25 +1,12 @@
 """What is wrong with readings that arrive: Gaussian noise, and gross errors now and then."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar, TypeAlias, Unpack
 
-import torch
-from tensordict import NestedKey
 from torch import Tensor
-from torchrl.data import Binary, Composite
 
 from torchrl_drbpn.functional.missingness import sample_noise, sample_spikes
-from torchrl_drbpn.transforms._base import (
-    Keys,
-    Role,
-    Step,
-    enter_new,
-    pair_keys,
-    read_numbers,
-    split_like,
-)
+from torchrl_drbpn.transforms._base import Role, Step, read_numbers
 from torchrl_drbpn.transforms.seeding import SeededKeys, SeededTransform
 
 Numbers: TypeAlias = float | Sequence[float] | Tensor
@@ -79,17 +66,14 @@ class ObservationSpikes(SeededTransform):
             per component, shape `(obs,)`.
         spike_std: standard deviation of the error in observation units, finite, likewise.
 
-    Keyword Args:
-        spiked_key: key (or one key per observation) under which the entries that were hit are
-            recorded, bool `(*batch, obs)`; None, the default, records nothing.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> spikes = ObservationSpikes(0.05, 10.0, spiked_key="spiked")
+        >>> spikes = ObservationSpikes(0.05, 10.0)
         >>> data = spikes._call(TensorDict({"observation": torch.zeros(1000, 3)}, [1000]))
-        >>> bool(((data["observation"] != 0) == data["spiked"]).all())
+        >>> 0 < int((data["observation"] != 0).sum()) < 3000
         True
     """
 
@@ -102,20 +86,9 @@ class ObservationSpikes(SeededTransform):
         self,
         probability: Numbers,
         spike_std: Numbers,
-        *,
-        spiked_key: Keys | None = None,
         **keys: Unpack[SeededKeys],
     ) -> None:
         super().__init__(**keys)
-        self.spiked_keys: list[NestedKey] = []
-        if spiked_key is not None:
-            self.spiked_keys = pair_keys(self.in_keys, spiked_key, name="spiked_key", default="")
-        taken = [*self.in_keys, *self.mask_keys, *self.complete_keys]
-        if not set(self.spiked_keys).isdisjoint(taken):
-            raise ValueError(
-                f"`spiked_key` must name keys of its own, got {self.spiked_keys} beside {taken}."
-            )
-        self.out_keys = [*self.out_keys, *self.spiked_keys]
         share = f"{NUMBERS}, in [0, 1]"
         self.probability = read_numbers(probability, "probability", share, most=1.0)
         self.spike_std = read_numbers(spike_std, "spike_std", STD)
@@ -123,19 +96,5 @@ class ObservationSpikes(SeededTransform):
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         x = step.observation
         probability, std = self.probability.to(x), self.spike_std.to(x)
-        error, hit = sample_spikes(probability, std, x, self.generator(x.device))
-        if self.spiked_keys:
-            parts = [step.data.get(key) for key in self.in_keys]
-            arrived = split_like(hit & step.observed, parts)
-            for key, part in zip(self.spiked_keys, arrived, strict=True):
-                step.data.set(key, part)
+        error, _ = sample_spikes(probability, std, x, self.generator(x.device))
         return x + error, step.observed
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Widen the observation and enter, on request, what was complete and what was hit."""
-        spec = super().transform_observation_spec(observation_spec)
-        for key, spiked in zip(self.in_keys, self.spiked_keys, strict=False):
-            leaf = spec[key]
-            mask = Binary(shape=leaf.shape, device=leaf.device, dtype=torch.bool)
-            enter_new(spec, spiked, mask, self)
-        return spec

@@ -1,7 +1,5 @@
 """Readings that come late, in another order than they were taken, or only now and then."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar, Literal, TypeAlias, Unpack
 

@@ -1,17 +1,13 @@
 """Sensors that fail for a while: outages that last, one sensor or one group at a time."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal, Unpack
 
 import torch
-from tensordict import NestedKey
 from torch import Tensor
 
 from torchrl_drbpn.functional.missingness import outage_rates, sample_working
 from torchrl_drbpn.transforms._base import Role, Step
-from torchrl_drbpn.transforms._carried import CarriedStateTransform, Groups
-from torchrl_drbpn.transforms.seeding import SeededKeys
+from torchrl_drbpn.transforms._carried import CarriedKeys, CarriedStateTransform
 
 
 class SensorOutages(CarriedStateTransform):
@@ -31,7 +27,7 @@ class SensorOutages(CarriedStateTransform):
     is off with probability $\eta (1 - (1 - a - b)^t)$, a and b being the two probabilities above.
     Ratios of single episodes scatter more than under MCAR: report the realised one.
 
-    Which sensors work travels in the tensordict under `state_key`, as the counts of TorchRL's
+    Which sensors work travels in the tensordict under `state_keys`, as the counts of TorchRL's
     `StepCounter` do. A simulator that resets itself inside its step carries outages over to the
     next episode, whatever `initial` says.
 
@@ -44,7 +40,7 @@ class SensorOutages(CarriedStateTransform):
         groups: lists of indices of sensors that go together (negative ones count from the end),
             each index in one list at most; entries in none always arrive. None, the default: every
             entry by itself.
-        state_key: bool `(*batch, groups)`, True for a group that works; by default `sensor_on`
+        state_keys: bool `(*batch, groups)`, True for a group that works; by default `sensor_on`
             beside the first observation.
         **keys: `seed`, `in_keys`, `mask_keys`, `complete_key` as in `ObservationMissingness`.
 
@@ -60,7 +56,6 @@ class SensorOutages(CarriedStateTransform):
     role: ClassVar[Role] = "missingness"
     stream: ClassVar[int] = 3
     state_names: ClassVar[tuple[str, ...]] = ("sensor_on",)
-    state_argument: ClassVar[str] = "state_key"
 
     def __init__(
         self,
@@ -68,11 +63,9 @@ class SensorOutages(CarriedStateTransform):
         mean_length: float,
         *,
         initial: Literal["stationary", "on"] = "stationary",
-        groups: Groups | None = None,
-        state_key: NestedKey | None = None,
-        **keys: Unpack[SeededKeys],
+        **keys: Unpack[CarriedKeys],
     ) -> None:
-        super().__init__(groups=groups, state_keys=state_key, **keys)
+        super().__init__(**keys)
         self.rates = outage_rates(eta, mean_length)
         self.eta, self.mean_length = float(eta), float(mean_length)
         if initial not in ("stationary", "on"):

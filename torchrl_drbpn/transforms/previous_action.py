@@ -1,7 +1,5 @@
 """Put the action of the last step beside the observation that it led to."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch

@@ -1,7 +1,5 @@
 """Where the random transforms take their numbers from, and how a whole environment is seeded."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import warnings

@@ -1,7 +1,5 @@
 """Readings that arrive and are wrong for a while: sensors that are stuck, sensors that drift."""
 
-from __future__ import annotations
-
 import math
 from numbers import Real
 from typing import ClassVar, Unpack
