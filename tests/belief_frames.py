@@ -27,7 +27,7 @@ class BeliefFrames:
     def frame_keys(self):
         return (self.observation, "observed", "previous_action", "is_init")
 
-    def make_frames(self, shape, dtype=torch.float32, seed=0, obs=OBS):
+    def make_frames(self, shape, dtype=torch.float32, seed=0, obs=OBS, action=ACTION):
         """Return what the environment writes, nowhere an episode start."""
         g = torch.Generator().manual_seed(seed)
         observed = torch.rand(*shape, obs, generator=g) < 0.6
@@ -36,7 +36,7 @@ class BeliefFrames:
             {
                 self.observation: torch.where(observed, observation, 0.0),
                 "observed": observed,
-                "previous_action": torch.randn(*shape, ACTION, generator=g, dtype=dtype),
+                "previous_action": torch.randn(*shape, action, generator=g, dtype=dtype),
                 "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
             },
             shape,

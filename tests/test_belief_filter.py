@@ -146,14 +146,6 @@ def test_the_initial_belief_starts_at_zero_with_its_std(kind):
     torch.testing.assert_close(model.initial_cov, expected, rtol=1e-12, atol=1e-14)
 
 
-def test_it_can_be_cast():
-    model, inputs = make_kind("network Q", 3), make_inputs(3)
-    expected = model(*inputs).mean
-    cast = copy.deepcopy(model).to(torch.float32)
-    floats = Inputs(*(v.float() if v is not None and v.dtype == F64 else v for v in inputs))
-    torch.testing.assert_close(cast(*floats).mean, expected.float(), rtol=1e-3, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

@@ -23,7 +23,10 @@ OPTIONAL = (
 
 
 make_filter = functools.partial(make_any_filter, OBS, ACTION)
-make_frames = functools.partial(BeliefModuleContract().make_frames, dtype=torch.float64)
+
+
+def make_frames(shape, dtype=torch.float64, *args, **kwargs):
+    return BeliefModuleContract().make_frames(shape, dtype, *args, **kwargs)
 
 
 def with_state(frames, state):
@@ -273,21 +276,10 @@ def draw_case(obs, state, action, batch, time, share, dtype, seed):
     """A module, and trajectories that begin in mid-episode with resets inside."""
     g = torch.Generator().manual_seed(seed)
     module = BeliefFilterModule(make_any_filter(obs, action, dtype, state))
-    shape = (*batch, time)
-    is_init = torch.rand(*shape, 1, generator=g) < 0.2
-    data = TensorDict(
-        {
-            "observation": torch.randn(*shape, obs, generator=g, dtype=dtype),
-            "observed": torch.rand(*shape, obs, generator=g) < share,
-            "previous_action": torch.randn(*shape, action, generator=g, dtype=dtype),
-            "is_init": is_init,
-            "recurrent": {
-                "mean": torch.randn(*shape, state, generator=g, dtype=dtype),
-                "age": torch.where(is_init, 0, 3),
-            },
-        },
-        shape,
-    )
+    data = with_state(make_frames((*batch, time), dtype, seed, obs, action), state)
+    data["observed"] = torch.rand(*data.shape, obs, generator=g) < share
+    data["is_init"] = torch.rand(*data.shape, 1, generator=g) < 0.2
+    data["recurrent", "age"].masked_fill_(data["is_init"], 0)
     return module, data
 
 

@@ -273,19 +273,6 @@ def test_a_weight_is_a_variance_in_values_and_all_gradients(
     assert_same(problem, problem.library(form), problem.oracle())
 
 
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_weights_of_one_change_no_bit_and_of_zero_are_missing_entries(state, obs):
-    problem = Problem(state, obs)
-    weight = torch.ones(problem.observed.shape, dtype=torch.float64)
-    plain, ones = (problem.run("pytorch", weight=w, return_cov=True) for w in (None, weight))
-    for a, b in zip(plain, ones, strict=True):
-        assert torch.equal(a, b)
-    gone = problem.run("pytorch", weight=0 * weight)
-    problem.observed = torch.zeros_like(problem.observed)
-    assert torch.equal(gone.mean, problem.run("pytorch").mean)
-    assert not gone.log_likelihood.any()
-
-
 def filter_with_a_narrow_network():
     problem = Problem(3, 5)
     problem.leaves["weight0"] = problem.leaves["weight0"][:, 1:]

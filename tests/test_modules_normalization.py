@@ -125,16 +125,18 @@ def test_a_reading_that_is_no_number_is_refused_and_not_learned(bad):
     assert_same_state(norm, before)
 
 
-@pytest.mark.parametrize("wild", [1e5, 1e160])
+@pytest.mark.parametrize("wild", [1e5, -1e5, 1e160, 1.7e308])
 @pytest.mark.parametrize("first", [True, False], ids=["first", "later"])
-def test_one_wild_reading_among_20000_undoes_no_sensor(wild, first):
-    clean = make_rollout(batch=(100,), time=200, missing=0.0)
+@pytest.mark.parametrize("rows", [1, 100], ids=["of 200", "of 20,000"])
+def test_one_wild_reading_undoes_no_sensor(wild, first, rows):
+    clean = make_rollout(batch=(rows,), time=200, missing=0.0)
     spoilt = clean.clone()
-    spoilt["observation"][3, 50, 1] = wild
+    spoilt["observation"][0, 50, 1] = wild
     rollouts = (spoilt,) if first else (clean, spoilt)
     norm, expected = learned(*rollouts), learned(*[clean] * len(rollouts))
-    torch.testing.assert_close(norm.std, expected.std, rtol=0.05, atol=0)
-    torch.testing.assert_close(norm.mean, expected.mean, rtol=0, atol=0.02)
+    few = rows == 1
+    torch.testing.assert_close(norm.std, expected.std, rtol=0.6 if few else 0.05, atol=0)
+    torch.testing.assert_close(norm.mean, expected.mean, rtol=0, atol=0.6 if few else 0.02)
 
 
 def test_in_float32_nothing_overflows():

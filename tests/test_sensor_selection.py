@@ -4,8 +4,7 @@ import oracles
 import pytest
 import torch
 
-from torchrl_drbpn import functional, select_sensors
-from torchrl_drbpn.functional import Belief
+from torchrl_drbpn import select_sensors
 
 DOUBLE = torch.float64
 EYE = torch.eye(3)
@@ -38,14 +37,6 @@ def problem(seed, obs=7, state=4, full=False):
     return H, oracles.spd(state, g), R
 
 
-def updated(H, P, R, rows):
-    """The covariance that the library's own update leaves with these rows observed."""
-    observed = torch.zeros(len(H), dtype=torch.bool)
-    observed[rows] = True
-    belief = Belief(torch.zeros(len(P), dtype=DOUBLE), P)
-    return functional.update(belief, torch.zeros(len(H), dtype=DOUBLE), observed, H, R).cov
-
-
 SHAPES = [pytest.param(6, 3, id="obs>state"), pytest.param(4, 6, id="obs<state")]
 
 
@@ -59,12 +50,12 @@ def test_objective_and_information_are_those_of_update_on_the_chosen_rows(
     H, P, R = problem(3, obs, state, full)
     count = obs - len(always)
     chosen = select_sensors(H, P, R, count, criterion=criterion, always=always)
-    before = criterion_value("D", updated(H, P, R, [*always]))
+    before = information(H, P, R, [*always])
     for k in range(count):
         rows = [*always, *chosen.indices[: k + 1].tolist()]
-        cov = updated(H, P, R, rows)
-        assert chosen.objective[k] == pytest.approx(criterion_value(criterion, cov), abs=1e-10)
-        gained = 0.5 * (before - criterion_value("D", cov))
+        objective = criterion_value(criterion, posterior(H, P, R, rows))
+        assert chosen.objective[k] == pytest.approx(objective, abs=1e-10)
+        gained = information(H, P, R, rows) - before
         assert chosen.information[k] == pytest.approx(gained, abs=1e-10)
 
 
@@ -115,7 +106,7 @@ def test_neither_the_order_of_the_sensors_nor_their_units_matter(seed, criterion
 
 def test_ties_go_to_the_lowest_index_in_spite_of_rounding():
     """Three copies of a rotated orthogonal frame: every gain is equal in exact arithmetic."""
-    g = torch.Generator().manual_seed(0)
+    g = torch.Generator().manual_seed(1)
     frame = torch.linalg.qr(torch.randn(5, 5, generator=g, dtype=DOUBLE)).Q
     H = torch.cat([frame, -frame, frame])
     for criterion in ("D", "A"):

@@ -1,5 +1,7 @@
 """PreviousAction and FillLastObserved: what happened before, in this episode."""
 
+from functools import partial
+
 import pytest
 import torch
 from contracts import StaircaseEnv
@@ -20,19 +22,23 @@ def expected_shift(data):
     return shifted
 
 
-@pytest.mark.parametrize("where", ["inside", "outside", "batched", "self-resetting"])
-def test_it_is_the_action_of_the_step_before_and_zero_after_every_reset(where):
-    def simulator():
-        return TransformedEnv(StaircaseEnv(horizon=2), Compose())
+def placed(where, simulator, add):
+    """Let `add` append to a simulator, to each of two in a batch, or to the batch."""
+    if where == "inside":
+        return SerialEnv(2, lambda: add(simulator()))
+    return add(SerialEnv(2, simulator) if where == "outside" else simulator())
 
-    if where == "batched":
-        env = simulator().append_transform(PreviousAction())
-    elif where == "inside":
-        env = SerialEnv(2, lambda: simulator().append_transform(PreviousAction()))
-    elif where == "outside":
-        env = TransformedEnv(SerialEnv(2, simulator), PreviousAction())
-    else:
-        env = TransformedEnv(SelfResettingEnv(), PreviousAction())
+
+def staircase(where, horizon):
+    return SelfResettingEnv if where == "self-resetting" else partial(StaircaseEnv, horizon=horizon)
+
+
+EVERYWHERE = pytest.mark.parametrize("where", ["inside", "outside", "alone", "self-resetting"])
+
+
+@EVERYWHERE
+def test_it_is_the_action_of_the_step_before_and_zero_after_every_reset(where):
+    env = placed(where, staircase(where, 2), lambda env: TransformedEnv(env, PreviousAction()))
     data = env.rollout(11, break_when_any_done=False)
     done = data["next", "done"]
     assert done.any(-2).all()
@@ -95,20 +101,10 @@ def test_a_discrete_action_keeps_dtype_and_shape(categorical):
     assert (data["previous_action"][0] == 0).all()
 
 
-@pytest.mark.parametrize("where", ["single", "inside", "outside"])
+@pytest.mark.parametrize("where", ["alone", "inside", "outside"])
 def test_an_index_action_may_be_written_as_one_hot_and_is_zero_at_a_start(where):
-    def simulator():
-        return GymEnv("CartPole-v1", categorical_action_encoding=True)
-
-    def with_it(env):
-        return TransformedEnv(env, PreviousAction(one_hot=True))
-
-    if where == "single":
-        env = with_it(simulator())
-    elif where == "inside":
-        env = SerialEnv(2, lambda: with_it(simulator()))
-    else:
-        env = with_it(SerialEnv(2, simulator))
+    simulator = partial(GymEnv, "CartPole-v1", categorical_action_encoding=True)
+    env = placed(where, simulator, lambda env: TransformedEnv(env, PreviousAction(one_hot=True)))
     check_env_specs(env)
     data = env.rollout(150, break_when_any_done=False)
     following = data["next", "previous_action"]
@@ -133,11 +129,10 @@ def test_an_absent_action_is_named():
         PreviousAction()._step(TensorDict(), TensorDict())
 
 
-def masked(env, eta=0.5, seed=0):
-    """Append missingness that keeps the complete observation beside what is left of it."""
-    return env.append_transform(
-        ObservationMissingness("mcar", eta, seed=seed, complete_key="complete_observation")
-    )
+def filled(env, **kwargs):
+    """Append missingness that keeps the complete observation, and what fills the gaps."""
+    gaps = ObservationMissingness("mcar", 0.5, seed=0, complete_key="complete_observation")
+    return TransformedEnv(env, Compose(gaps, FillLastObserved(**kwargs)))
 
 
 def filled_by_hand(data, fill_value):
@@ -157,40 +152,21 @@ def filled_by_hand(data, fill_value):
 
 
 @pytest.mark.parametrize("fill_value", [0.0, -7.0])
-@pytest.mark.parametrize("where", ["inside", "outside", "batched"])
+@EVERYWHERE
 def test_it_equals_filling_step_by_step(where, fill_value):
-    def simulator():
-        return TransformedEnv(StaircaseEnv(horizon=4), Compose())
-
-    def filler():
-        return FillLastObserved(fill_value=fill_value)
-
-    if where == "batched":
-        env = masked(simulator()).append_transform(filler())
-    elif where == "inside":
-        env = SerialEnv(2, lambda: masked(simulator()).append_transform(filler()))
-    else:
-        env = masked(TransformedEnv(SerialEnv(2, simulator), Compose())).append_transform(filler())
+    env = placed(where, staircase(where, 4), partial(filled, fill_value=fill_value))
     data = env.rollout(17, break_when_any_done=False)
     assert data["next", "done"].sum() > 6
     assert (data["observed"].float().mean() - 0.5).abs() < 0.2
+    # an environment that resets itself overwrites the last observation: the roots alone are read
     data = data.reshape(-1, 17)
     assert torch.equal(data["observation"], filled_by_hand(data, fill_value))
 
 
-def test_an_environment_that_resets_itself_starts_from_the_fill_value():
-    env = masked(TransformedEnv(SelfResettingEnv(), Compose()))
-    env = env.append_transform(FillLastObserved(fill_value=-7.0))
-    data = env.rollout(17, break_when_any_done=False)
-    assert data["next", "done"].sum() > 6
-    # such an environment overwrites the last observation of an episode: look at the roots alone
-    assert torch.equal(data["observation"], filled_by_hand(data, -7.0))
-
-
 def test_with_other_out_keys_the_observation_stays_as_it_was():
-    env = masked(TransformedEnv(StaircaseEnv(), Compose()))
-    env = env.append_transform(FillLastObserved(out_keys="filled", state_keys="memory"))
-    data = env.rollout(8, break_when_any_done=False)
+    data = filled(StaircaseEnv(), out_keys="filled", state_keys="memory").rollout(
+        8, break_when_any_done=False
+    )
     assert (data["observation"][~data["observed"]] == 0).all()
     assert torch.equal(data["filled"], filled_by_hand(data, 0.0))
     assert torch.equal(data["memory"], data["filled"])
