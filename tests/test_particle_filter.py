@@ -16,9 +16,7 @@ from torchrl_drbpn.functional import (
     ParticleStep,
     ProposalOutput,
     StateSpace,
-    effective_sample_size,
     filter_sequence,
-    log_mean_weight,
     particle_sequence,
     resample,
     systematic_ancestors,
@@ -234,12 +232,6 @@ def test_optional_entries_are_written_where_asked_for(over_time):
 def test_a_wrong_size_is_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_filter(**kwargs)
-
-
-def test_the_mean_weight_survives_weights_that_underflow():
-    log_weight = torch.tensor([-2000.0, -2000.0], dtype=torch.float64)
-    assert log_mean_weight(log_weight).item() == pytest.approx(-2000)
-    assert effective_sample_size(log_weight).item() == pytest.approx(2)
 
 
 def test_systematic_resampling_gives_each_particle_its_share_rounded_and_on_average_exactly():

@@ -20,7 +20,7 @@ from torchrl_drbpn import (
     GaussianTransition,
     PolicyStep,
 )
-from torchrl_drbpn.functional import innovation_weights, robust_weights
+from torchrl_drbpn.functional import innovation_weights, robust_sequence_weights
 from torchrl_drbpn.functional.robust import Robust
 
 OBS, ACTION, BATCH, TIME = 5, 2, 6, 5
@@ -123,7 +123,7 @@ def test_readings_within_the_threshold_are_believed_to_the_bit(kind):
     model, plain = make_model(kind, robust="huber", robust_threshold=1e3), make_model(kind)
     mean, *rest = inputs(model, wrong=0.0)
     options = {"cov": before(model), "robust": "huber", "threshold": 1e3}
-    weights = robust_weights(model.state_space(), *first((mean, *rest)), **options)
+    weights = robust_sequence_weights(model.state_space(), mean, *rest, **options)
     assert (weights == 1).all()
     assert not weights.requires_grad
     outs = (m(mean, before(m), *rest, return_cov=True) for m in (model, plain))

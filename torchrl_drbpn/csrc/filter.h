@@ -1,17 +1,12 @@
 /* The belief filter over [batch, time] and its reverse pass as two functions, for a constant Q, eq.
  * (8), (10), (12) [DRBPN]. The same sums as functional/pytorch_form.py, where PyTorch needs some
- * hundred small operations a minibatch. filter_float.c and filter_double.c compile it, once for each `given`:
+ * hundred small operations a minibatch. filter_float.c and filter_double.c compile it, once for each
+ * `given`.
  *
- *   linalg.h       vectors, matrix products, many small inverses at once
- *   memory.h       sizes and where everything lies
- *   innovation.h   the gain by inv(S), obs x obs, and back
- *   information.h  the gain by C = inv(inv(P) + H' W H), state x state, and back
- *   propagated.h   the same with P = F Sigma F' + Q, its recursion ahead of the means
- *
- * The two forms differ in how z = inv(S) e and the gain of a row come about, and in what the
- * covariances receive. What is here serves both: the transition, the innovation
- * e = y - H m - B a - d of the predicted mean, their gradients, and at the end those of weights,
- * biases, H, B and d.
+ * The two forms, innovation.h and information.h, differ in how z = inv(S) e and the gain of a row
+ * come about, and in what the covariances receive. What is here serves both: the transition, the
+ * innovation e = y - H m - B a - d of the predicted mean, their gradients, and at the end those of
+ * weights, biases, H, B and d.
  *
  * What the caller gives and gets is of type `given`, float or double; all arithmetic is in double. S
  * is as ill-conditioned as signal over noise, and where H is of low rank float loses most digits of

@@ -39,7 +39,6 @@ from torchrl_drbpn.functional.missingness import (
     missing_probability,
     outage_rates,
     sample_delay,
-    sample_fault_steps,
     sample_mask,
     sample_noise,
     sample_spikes,
@@ -53,19 +52,12 @@ from torchrl_drbpn.functional.particles import (
     ParticleOutput,
     ParticleStep,
     ProposalOutput,
-    diagonal_log_density,
-    effective_sample_size,
-    log_mean_weight,
     particle_sequence,
     particle_step,
     resample,
     systematic_ancestors,
 )
-from torchrl_drbpn.functional.robust import (
-    innovation_weights,
-    robust_sequence_weights,
-    robust_weights,
-)
+from torchrl_drbpn.functional.robust import innovation_weights, robust_sequence_weights
 from torchrl_drbpn.functional.sensor_selection import SensorSelection, select_sensors
 from torchrl_drbpn.functional.smoothing import (
     Forecast,
@@ -94,9 +86,7 @@ __all__ = [
     "TransitionMLP",
     "chi_square_quantile",
     "consistency",
-    "diagonal_log_density",
     "draw_mechanism",
-    "effective_sample_size",
     "filter_sequence",
     "filter_step",
     "filtered_cov",
@@ -106,7 +96,6 @@ __all__ = [
     "innovation_weights",
     "inverse_softplus",
     "log_likelihood",
-    "log_mean_weight",
     "masked_cov",
     "masked_log_density",
     "missing_probability",
@@ -122,10 +111,8 @@ __all__ = [
     "propagate",
     "resample",
     "robust_sequence_weights",
-    "robust_weights",
     "row_jacobian",
     "sample_delay",
-    "sample_fault_steps",
     "sample_mask",
     "sample_noise",
     "sample_spikes",

@@ -197,22 +197,6 @@ def sample_working(
     return torch.where(working, uniform >= rates.failure, uniform < rates.repair)
 
 
-def sample_fault_steps(
-    steps: Tensor | None, rates: OutageRates, like: Tensor, generator: torch.Generator | None
-) -> Tensor:
-    """Draw how many steps, int64, every fault has lasted, 0 for a sensor that works; None: all do.
-
-    Example:
-        >>> before = torch.tensor([0, 3, 0])
-        >>> sample_fault_steps(before, OutageRates(1.0, 0.0), before, None).tolist()
-        [1, 4, 1]
-    """
-    if steps is None:
-        return torch.zeros(like.shape, dtype=torch.int64, device=like.device)
-    working = sample_working(steps == 0, rates, like, generator)
-    return (steps + 1).masked_fill(working, 0)
-
-
 def sample_delay(
     least: Tensor, most: Tensor, like: Tensor, generator: torch.Generator | None
 ) -> Tensor:

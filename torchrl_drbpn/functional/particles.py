@@ -82,62 +82,6 @@ class ParticleOutput(NamedTuple):
     expected: Tensor
 
 
-# ------------------------------------------------------------------------------ densities, weights
-def diagonal_log_density(
-    value: Tensor, gaussian: DiagonalGaussian, observed: Tensor | None = None
-) -> Tensor:
-    r"""Evaluate log N(value; mean, diag(variance)) on the observed entries.
-
-    .. math:: \log p = -\tfrac12 \sum_{i: m_i}
-        \left( (x_i - \mu_i)^2 / v_i + \log v_i + \log 2\pi \right)
-
-    Of ``value`` x ``(*batch, dim)``, a Gaussian that broadcasts with it, and the bool mask m, None:
-    everything arrived. Nats, ``(*batch,)``; with nothing observed exactly 0.
-
-    Example:
-        >>> gaussian = DiagonalGaussian(torch.zeros(2), torch.ones(2))
-        >>> x, seen = torch.tensor([1.0, float("nan")]), torch.tensor([True, False])
-        >>> one = torch.distributions.Normal(0.0, 1.0).log_prob(x[0])
-        >>> bool(torch.isclose(diagonal_log_density(x, gaussian, seen), one))
-        True
-    """
-    mean, variance = gaussian
-    if observed is not None:
-        # Before any arithmetic: a NaN under a False mask must reach neither value nor gradient.
-        value = zero_missing(value, observed)
-    terms = (value - mean).square() / variance + variance.log() + LOG_2PI
-    return -0.5 * (terms if observed is None else zero_missing(terms, observed)).sum(-1)
-
-
-def log_mean_weight(log_weight: Tensor) -> Tensor:
-    r"""Estimate the likelihood of a step: the log of the particles' mean weight.
-
-    .. math:: \log \hat p(x_t \mid x_{<t}) = \log \frac1K \sum_k w_t^k
-
-    §3.2 [DVRL 2018]: its sum over time is, in expectation, a lower bound of the marginal
-    log-likelihood. From ``(*batch, particles)`` to ``(*batch,)``, nats.
-
-    Example:
-        >>> log_mean_weight(torch.tensor([2.0, 4.0]).log()).exp().item()
-        3.0
-    """
-    return log_weight.logsumexp(-1) - math.log(log_weight.shape[-1])
-
-
-def effective_sample_size(log_weight: Tensor) -> Tensor:
-    r"""Count the equally weighted particles that would estimate as well as these.
-
-    .. math:: \mathrm{ESS} = 1 / \sum_k \bar w_k^2
-
-    From log-weights ``(*batch, particles)``, which need not be normalised, to ``(*batch,)``.
-
-    Example:
-        >>> round(effective_sample_size(torch.zeros(8)).item(), 4)
-        8.0
-    """
-    return 1.0 / log_weight.softmax(-1).square().sum(-1)
-
-
 # -------------------------------------------------------------------------------------- resampling
 @torch.no_grad()
 def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
@@ -205,12 +149,15 @@ def particle_step(
     # log p - log q: the constants cancel, and (z - mean_q)^2 / variance_q is the noise squared.
     surprise = (latent - transition.mean).square() / transition.variance
     ratio = noise.proposal.square() - surprise + (proposal.variance / transition.variance).log()
-    seen = diagonal_log_density(observation.unsqueeze(-2), step.emission, observed.unsqueeze(-2))
-    log_weight = 0.5 * ratio.sum(-1) + seen
+    # Filled before any arithmetic: a NaN under a False mask must reach neither value nor gradient.
+    arrived = zero_missing(observation, observed).unsqueeze(-2)
+    mean, variance = step.emission
+    terms = (arrived - mean).square() / variance + variance.log() + LOG_2PI
+    log_weight = 0.5 * (ratio.sum(-1) - zero_missing(terms, observed.unsqueeze(-2)).sum(-1))
     return ParticleOutput(
         step.hidden,
         log_weight,
-        log_mean_weight(log_weight),
+        log_weight.logsumexp(-1) - math.log(log_weight.shape[-1]),
         step.embedding,
         latent,
         step.emission.mean,

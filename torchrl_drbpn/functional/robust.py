@@ -92,37 +92,6 @@ def innovation_weights(
     return torch.where(observed, noise / (noise + held), 1.0)
 
 
-def robust_weights(
-    model: StateSpace,
-    mean: Tensor,
-    previous_action: Tensor,
-    observation: Tensor,
-    observed: Tensor,
-    reset: Tensor,
-    *,
-    robust: Robust,
-    threshold: float = 4.0,
-    cov: Tensor | None = None,
-) -> Tensor:
-    """Weigh the readings of one step, see :func:`innovation_weights`.
-
-    Arguments, result and errors are those of :func:`robust_sequence_weights`, without time.
-
-    Example:
-        >>> from torchrl_drbpn import BeliefFilter
-        >>> model, seen = BeliefFilter(3, 1).state_space(), torch.ones(3) > 0
-        >>> x, start = torch.tensor([100.0, 0.1, -0.1]), (torch.zeros(3), torch.zeros(1))
-        >>> w = robust_weights(model, *start, x, seen, torch.tensor(True), robust="huber")
-        >>> bool(w[0] < 0.03), w[1:].tolist()
-        (True, [1.0, 1.0])
-    """
-    weights = robust_sequence_weights(
-        model, mean, previous_action.unsqueeze(-2), observation.unsqueeze(-2),
-        observed.unsqueeze(-2), reset.unsqueeze(-1), robust=robust, threshold=threshold, cov=cov,
-    )  # fmt: skip
-    return weights.squeeze(-2)
-
-
 @torch.no_grad()
 def robust_sequence_weights(
     model: StateSpace,

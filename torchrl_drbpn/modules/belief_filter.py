@@ -18,7 +18,6 @@ from torchrl_drbpn.functional import (
     forecast,
     predict_step,
     robust_sequence_weights,
-    robust_weights,
     smooth_sequence,
 )
 from torchrl_drbpn.functional.gaussian import without_autocast
@@ -251,7 +250,7 @@ class BeliefFilter(nn.Module):
     ) -> FilterOutput:
         """Filter one step; arguments, result and errors as in :meth:`forward`, without time."""
         given = (mean, previous_action, observation, observed, reset)
-        return self._run(filter_step, robust_weights, given, {"cov": cov}, return_cov)
+        return self._run(filter_step, _weigh_step, given, {"cov": cov}, return_cov)
 
     def _run(
         self,
@@ -331,3 +330,11 @@ class BeliefFilter(nn.Module):
         """Predict the steps ahead, see :func:`functional.forecast`."""
         cov = cov if self.covariance == "propagated" else None
         return forecast(self.state_space(), mean, cov, action, **options)
+
+
+def _weigh_step(
+    model: StateSpace, mean: Tensor, *inputs: Tensor, cov: Tensor | None, **options: Any
+) -> Tensor:
+    """Weigh the readings of one step: a sequence of one."""
+    time = [x.unsqueeze(mean.ndim - 1) for x in inputs]
+    return robust_sequence_weights(model, mean, *time, cov=cov, **options).squeeze(-2)

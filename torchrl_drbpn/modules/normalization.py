@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_drbpn.functional.gaussian import check_observed
 from torchrl_drbpn.functional.running_moments import (
     RunningMoments,
     masked_moments,
@@ -208,14 +209,8 @@ class MaskedObservationNorm(TensorDictModuleBase):
                 f"`{self._observation_key}` must have {self.obs_dim} components in its last "
                 f"dimension, got shape {tuple(value.shape)}. Is it another robot's?"
             )
-        if observed is not None and (
-            observed.dtype is not torch.bool or observed.shape != value.shape
-        ):
-            raise ValueError(
-                f"`{self._observed_key or 'observed'}` must be bool of shape {tuple(value.shape)}, "
-                f"one entry for every component, got {observed.dtype} of shape "
-                f"{tuple(observed.shape)}. Is it the mask of another observation?"
-            )
+        if observed is not None:
+            check_observed(value, observed)
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         keys = [key for key in (self._observation_key, self._observed_key) if key is not None]

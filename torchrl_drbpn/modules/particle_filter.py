@@ -3,9 +3,7 @@
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
 
-from torchrl_drbpn.functional import effective_sample_size
 from torchrl_drbpn.modules.particle_model import ParticleFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 
@@ -50,9 +48,7 @@ class ParticleFilterModule(RecurrentBeliefModule):
         self,
         filter: ParticleFilter,
         *,
-        in_key: NestedKey | None = None,
         in_keys: Keys = None,
-        out_key: NestedKey | None = None,
         out_keys: Keys = None,
         default_recurrent_mode: bool | None = None,
     ) -> None:
@@ -62,9 +58,8 @@ class ParticleFilterModule(RecurrentBeliefModule):
             ("recurrent", "log_weight"): (count,),
         }
         super().__init__(
-            filter, state, _DEFAULT, _OPTIONAL,
-            in_key, in_keys, out_key, out_keys, default_recurrent_mode,
-        )  # fmt: skip
+            filter, state, _DEFAULT, _OPTIONAL, in_keys, out_keys, default_recurrent_mode
+        )
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -86,7 +81,7 @@ class ParticleFilterModule(RecurrentBeliefModule):
             ("belief", "log_likelihood"): out.log_likelihood,
             ("belief", "observation"): (weight * out.expected).sum(-2),
             ("belief", "latent"): out.latent,
-            ("belief", "effective_sample_size"): effective_sample_size(out.log_weight),
+            ("belief", "effective_sample_size"): 1.0 / weight.square().sum((-2, -1)),
         }
         return self._write(tensordict, results, (out.hidden, out.log_weight, given.age + 1))
 

@@ -1,10 +1,9 @@
-"""What the transforms share: keys, numbers, specs, order, and the frame of those that corrupt."""
+"""What the transforms share: keys, numbers, specs, and the frame of those that corrupt."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from itertools import takewhile
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, TypedDict
+from typing import Any, ClassVar, NamedTuple, TypeAlias, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -17,7 +16,6 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl_drbpn.functional.gaussian import zero_missing
 
 Keys: TypeAlias = NestedKey | Sequence[NestedKey]
-Role = Literal["noise", "missingness", "from_nan", "fill"]
 
 
 # ------------------------------------------------------------------------------------------- keys
@@ -220,7 +218,6 @@ class CorruptingTransform(Transform, ABC):
     the specs), and in data from outside an environment. A subclass writes `_corrupt`.
     """
 
-    role: ClassVar[Role]
     writes_mask: ClassVar[bool] = True
     # attributes that hold one number for all components, or one for each
     per_component: ClassVar[tuple[str, ...]] = ()
@@ -315,7 +312,6 @@ class CorruptingTransform(Transform, ABC):
     # ------------------------------------------------------------------------------------- specs
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Widen the observation, enter its mask and, on request, the complete observation."""
-        self._check_order()
         spec = observation_spec.clone()
         self._check(spec)
         for key, mask_key, complete_key in (row for vector in self._vectors for row in vector):
@@ -326,24 +322,6 @@ class CorruptingTransform(Transform, ABC):
                 spec[mask_key] = Binary(shape=leaf.shape, device=leaf.device, dtype=torch.bool)
             spec[key] = Unbounded(leaf.shape, leaf.device, leaf.dtype)
         return spec
-
-    def _check_order(self) -> None:
-        name, keys = type(self).__name__, set(self.in_keys)
-        for earlier in takewhile(lambda part: part is not self, chain_of(self)):
-            role, other = getattr(earlier, "role", None), type(earlier).__name__
-            if role is None or keys.isdisjoint([*earlier.in_keys, *earlier.out_keys]):
-                continue
-            if role == "fill" and self.role != "noise":
-                raise ValueError(
-                    f"`{other}` stands before `{name}`: what goes missing afterwards is never "
-                    f"filled. Put `{other}` after `{name}`."
-                )
-            # ObservedFromNaN destroys nothing: the complete observation may be recorded after it
-            if self.complete_keys and role in ("noise", "missingness"):
-                raise ValueError(
-                    f"`{name}` is asked for {self.complete_keys} but `{other}` has corrupted the "
-                    f"observation before it. Pass complete_key to `{other}` instead."
-                )
 
 
 def _join(parts: list[Tensor]) -> Tensor:

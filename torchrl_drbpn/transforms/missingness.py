@@ -20,7 +20,6 @@ from torchrl_drbpn.functional.missingness import (
 from torchrl_drbpn.transforms._base import (
     CorruptingTransform,
     CorruptionKeys,
-    Role,
     Step,
     as_key_list,
     read_leaf,
@@ -75,7 +74,6 @@ class ObservationMissingness(SeededTransform):
             the device of the data; None under "mcar" and before the first step.
     """
 
-    role: ClassVar[Role] = "missingness"
     stream: ClassVar[int] = 2
     _eta: float
 
@@ -181,8 +179,6 @@ class SensorReduction(CorruptingTransform):
         [[0.0, 1.0, 1.0], [1.0, 0.0, 1.0]]
     """
 
-    role: ClassVar[Role] = "missingness"
-
     def __init__(
         self,
         missing: Sequence[int] | Sequence[bool] | Tensor,
@@ -247,8 +243,6 @@ class ObservedFromNaN(CorruptingTransform):
         >>> data["observation"].tolist(), data["observed"].tolist()
         ([1.0, 0.0], [True, False])
     """
-
-    role: ClassVar[Role] = "from_nan"
 
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         return step.observation, ~step.observation.isnan() & step.observed

@@ -6,7 +6,7 @@ from typing import ClassVar, TypeAlias, Unpack
 from torch import Tensor
 
 from torchrl_drbpn.functional.missingness import sample_noise, sample_spikes
-from torchrl_drbpn.transforms._base import Role, Step, read_numbers
+from torchrl_drbpn.transforms._base import Step, read_numbers
 from torchrl_drbpn.transforms.seeding import SeededKeys, SeededTransform
 
 Numbers: TypeAlias = float | Sequence[float] | Tensor
@@ -35,7 +35,6 @@ class ObservationNoise(SeededTransform):
         True
     """
 
-    role: ClassVar[Role] = "noise"
     writes_mask: ClassVar[bool] = False
     per_component: ClassVar[tuple[str, ...]] = ("noise_std",)
     stream: ClassVar[int] = 1
@@ -77,7 +76,6 @@ class ObservationSpikes(SeededTransform):
         True
     """
 
-    role: ClassVar[Role] = "noise"
     writes_mask: ClassVar[bool] = False
     per_component: ClassVar[tuple[str, ...]] = ("probability", "spike_std")
     stream: ClassVar[int] = 4

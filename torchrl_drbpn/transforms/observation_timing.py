@@ -9,7 +9,7 @@ from torchrl.data import Composite
 from torchrl.envs import StepCounter
 
 from torchrl_drbpn.functional.missingness import sample_delay
-from torchrl_drbpn.transforms._base import Role, Step, chain_of, check_count
+from torchrl_drbpn.transforms._base import Step, chain_of, check_count
 from torchrl_drbpn.transforms._carried import CarriedKeys, CarriedStateTransform, read_steps
 
 Steps: TypeAlias = int | Sequence[int] | Tensor
@@ -53,7 +53,6 @@ class ObservationDelay(CarriedStateTransform):
         (False, [1.0, 2.0])
     """
 
-    role: ClassVar[Role] = "missingness"
     stream: ClassVar[int] = 5
     state_names: ClassVar[tuple[str, ...]] = ("delayed_observation", "delayed_observed")
     per_group: ClassVar[tuple[str, ...]] = ("delay", "max_delay")
@@ -148,7 +147,6 @@ class ObservationMultiRate(CarriedStateTransform):
         [True, True]
     """
 
-    role: ClassVar[Role] = "missingness"
     stream: ClassVar[int] = 6
     state_names: ClassVar[tuple[str, ...]] = ("steps_to_reading",)
     per_group: ClassVar[tuple[str, ...]] = ("period", "phase")

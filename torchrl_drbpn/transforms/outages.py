@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.missingness import outage_rates, sample_working
-from torchrl_drbpn.transforms._base import Role, Step
+from torchrl_drbpn.transforms._base import Step
 from torchrl_drbpn.transforms._carried import CarriedKeys, CarriedStateTransform
 
 
@@ -53,7 +53,6 @@ class SensorOutages(CarriedStateTransform):
         (True, True)
     """
 
-    role: ClassVar[Role] = "missingness"
     stream: ClassVar[int] = 3
     state_names: ClassVar[tuple[str, ...]] = ("sensor_on",)
 

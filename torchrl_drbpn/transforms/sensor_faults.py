@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import zero_missing
-from torchrl_drbpn.functional.missingness import OutageRates, sample_fault_steps, sample_noise
-from torchrl_drbpn.transforms._base import Role, Step, read_numbers
+from torchrl_drbpn.functional.missingness import OutageRates, sample_noise, sample_working
+from torchrl_drbpn.transforms._base import Step, read_numbers
 from torchrl_drbpn.transforms._carried import CarriedKeys, CarriedStateTransform, read_steps
 from torchrl_drbpn.transforms.noise import NUMBERS, STD, Numbers
 
@@ -17,7 +17,6 @@ from torchrl_drbpn.transforms.noise import NUMBERS, STD, Numbers
 class FaultyReadings(CarriedStateTransform):
     """A transform of readings that are wrong while their sensor has a fault; masks stay."""
 
-    role: ClassVar[Role] = "noise"
     writes_mask: ClassVar[bool] = False
 
     def __init__(
@@ -67,12 +66,15 @@ class FaultyReadings(CarriedStateTransform):
         x, carried = step.observation, self._carried(step)
         before, other = (None, None) if carried is None else carried
         like = self._group_like(x)
-        if self._rates is not None:
-            steps = sample_fault_steps(before, self._rates, like, self.generator(x.device))
-        elif before is None:
-            steps = torch.full_like(like, 1 - self._onset, dtype=torch.int64)
+        if before is None:
+            first = 0 if self._rates is not None else 1 - self._onset
+            steps = torch.full_like(like, first, dtype=torch.int64)
         else:
             steps = before + 1
+            if self._rates is not None:  # 0 for a sensor that works
+                generator = self.generator(x.device)
+                working = sample_working(before == 0, self._rates, like, generator)
+                steps = steps.masked_fill(working, 0)
         return steps, self._spread((steps > 0) & (steps <= self._last), x, False), other
 
 
