@@ -9,17 +9,10 @@ from torchrl.modules.utils import get_primers_from_module
 
 
 class BeliefFrames:
-    """What the contracts of belief modules share.
+    """What the contracts of belief modules share."""
 
-    Attributes:
-        tolerance32: how far one step at a time and whole sequences may differ in float32, as a
-            share of the largest entry.
-        tolerance64: the same in float64.
-        observation: where the modules read what arrived.
-    """
-
-    observation: str = "observation"
-
+    observation: str = "observation"  # where the modules read what arrived
+    # How far steps and sequences may differ, as a share of the largest entry.
     tolerance32: float = 1e-5
     tolerance64: float = 1e-10
 
@@ -66,10 +59,7 @@ class BeliefFrames:
             )
 
     def one_by_one(self, module, frames, start):
-        """Run step by step as a collector does; the primer's zeros where an episode starts.
-
-        The result holds the stored state at every step, as a collected rollout does.
-        """
+        """Return what a collector would: the stored state at every step, zeros at a start."""
         keys = self.state_keys(module)
         primers = self.primers(module)
         batch = frames.shape[:-1]

@@ -37,14 +37,10 @@ class BeliefModuleContract(BeliefModuleRefusals):
     One step at a time `is_init` starts from the module's initial state. Over time `is_init & (age
     == 0)` does, and `is_init` with an older age takes the stored state; without `is_init` the state
     of the step before is taken.
-
-    Attributes:
-        age_key: the root entry that counts updates since the reset.
-        all_outputs: every entry that the module can write.
     """
 
-    age_key: Any = ("recurrent", "age")
-    all_outputs: Any = None
+    age_key: Any = ("recurrent", "age")  # counts updates since the reset
+    all_outputs: Any = None  # every entry that the module can write
 
     # --- hooks
     def differentiable(self, out):

@@ -76,11 +76,6 @@ def parallel_env(workers, factory):
     return ParallelEnv(workers, factory, mp_start_method="fork")
 
 
-def with_transform(make_env, make_transform):
-    """Return `make_env()` with `make_transform()` appended."""
-    return make_env().append_transform(make_transform())
-
-
 def saved(state):
     """Return `state` after a trip through a file that is read without running code."""
     buffer = io.BytesIO()
@@ -111,10 +106,7 @@ def actions_in_float64():
 
 
 def with_belief_entries(env, primer=None, *, to_float32=True):
-    """Append what every belief module reads; half of the entries are missing.
-
-    In float64 the actions are float64 too, as the policy's are.
-    """
+    """Append what every belief module reads; half of the entries are missing."""
     for transform in (
         DoubleToFloat() if to_float32 else actions_in_float64(),
         PreviousAction(),

@@ -8,16 +8,10 @@ from contract_environments import saved
 
 
 class LossContract:
-    """Duties of a loss: what a TorchRL LossModule promises.
-
-    Attributes:
-        has_networks: whether the loss holds parameters.
-        reductions: the values of `reduction` that the constructor takes; empty where the held
-            losses decide.
-    """
+    """Duties of a loss: what a TorchRL LossModule promises."""
 
     has_networks: bool = True
-    reductions: tuple[str, ...] = ()
+    reductions: tuple[str, ...] = ()  # that the constructor takes; none where held losses decide
 
     # --- hooks
     def make_loss(self, **kwargs):
@@ -26,9 +20,7 @@ class LossContract:
 
     def make_loss_data(self, dtype=torch.float32):
         """Return a minibatch, `[batch, time]`."""
-        raise NotImplementedError(
-            f"{type(self).__name__} must say in `make_loss_data` what is read"
-        )
+        raise NotImplementedError
 
     # --- helpers
     def _total(self, out):

@@ -24,12 +24,7 @@ LOG_LIKELIHOOD = ("belief", "log_likelihood")
 
 
 class RecipeBeliefContract(BeliefFrames):
-    """Duties of what a builder under recipes/beliefs returns.
-
-    With or without memory, with or without a model: the recipe gives every belief module the same
-    entries and reads `features`; it collects step by step, learns over sequences cut from the
-    rollout, values the next beliefs in one step, and writes everything into files.
-    """
+    """Duties of what a builder under recipes/beliefs returns, with or without memory or model."""
 
     observation = "normalized_observation"
 

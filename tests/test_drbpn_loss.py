@@ -190,11 +190,7 @@ def test_a_detached_belief_learns_from_the_model_alone():
 
 
 def counted(agent, data):
-    """Log-likelihood of every received observation, and entries, from the row-deleting oracle.
-
-    Received are: the frame that a row begins with, the frame after every action, and the first
-    frame of every episode.
-    """
+    """Log-likelihood of every received observation, and entries, from the row-deleting oracle."""
     model = agent.belief.filter
     f = model.transition.mean_network()
     transition = oracles.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)

@@ -1,7 +1,4 @@
-"""One Kalman step under missing entries: the laws of `functional.kalman`, in float64.
-
-Laws over masks, shapes and dimensions drawn at random are in test_functional_properties.py.
-"""
+"""One Kalman step under missing entries: the laws of `functional.kalman`, in float64."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""The native form: sizes, transformations, wrong arguments, a package built without it.
-
-Its values and gradients are held to the oracle in test_functional_filtering.py.
-"""
+"""The native form: sizes, transformations, wrong arguments, a package built without it."""
 
 import re
 import shutil

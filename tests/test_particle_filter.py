@@ -1,7 +1,4 @@
-"""The particle filter as a belief module, its networks, its noise and its mathematics.
-
-PPO's invariants with it: test_pipeline.py.
-"""
+"""The particle filter as a belief module, its networks, its noise and its mathematics."""
 
 import pytest
 import torch

@@ -1,7 +1,4 @@
-"""The propagated covariance, P = F cov F' + Q: its digits, its Jacobian, its key.
-
-That every form is the oracle: test_functional_filtering.py; the module: test_belief_filter_module.
-"""
+"""The propagated covariance, P = F cov F' + Q: its digits, its Jacobian, its key."""
 
 import oracles
 import pytest

@@ -1,7 +1,4 @@
-"""The robust update: weights of readings, from leave-one-out scores to an exported policy.
-
-A weight as a noise variance: test_functional_filtering.py.
-"""
+"""The robust update: weights of readings, from leave-one-out scores to an exported policy."""
 
 import math
 import statistics

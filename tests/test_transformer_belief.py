@@ -1,7 +1,4 @@
-"""What the transformer belief remembers, for how long, and what its attention computes.
-
-That steps equal sequences over whole rollouts stands in test_recipe_beliefs.py.
-"""
+"""What the transformer belief remembers, for how long, and what its attention computes."""
 
 import pytest
 import torch

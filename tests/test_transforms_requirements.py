@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from contracts import ACTION, OBS, StaircaseEnv, gym_env, parallel_env, saved, with_transform
+from contracts import ACTION, OBS, StaircaseEnv, gym_env, parallel_env, saved
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -34,7 +34,7 @@ def simulator():
 def corrupted_simulator(case):
     env = simulator()
     for make in (*case.needs, case.make):
-        env = with_transform(lambda env=env: env, make)
+        env = env.append_transform(make())
     return env
 
 

@@ -122,24 +122,14 @@ def previous(before, after):
 
 @dataclass
 class Case:
-    """A transform and what it makes of an observation.
+    """A transform and what it makes of an observation."""
 
-    Attributes:
-        make: returns the transform; with a seed where it takes one.
-        check: asserts that `after` is what the transform makes of `before`, which is empty where
-            what came from the simulator is not known.
-        offline: whether the transform works on a replay buffer.
-        nan: whether it is made for NaN.
-        needs: transforms that stand before it.
-        keys: what must be float64 where the observation is.
-    """
-
-    make: Callable[..., Transform]
-    check: Check
-    offline: bool = False
-    nan: bool = False
-    needs: list[Callable[..., Transform]] = field(default_factory=list)
-    keys: tuple[str, ...] = ("observation",)
+    make: Callable[..., Transform]  # with a seed where it takes one
+    check: Check  # asserts what is made of `before`, which is empty where it is not known
+    offline: bool = False  # whether it works on a replay buffer
+    nan: bool = False  # whether it is made for NaN
+    needs: list[Callable[..., Transform]] = field(default_factory=list)  # that stand before it
+    keys: tuple[str, ...] = ("observation",)  # float64 where the observation is
 
     def data(self, batch, dtype=torch.float32):
         """Return what an environment's step would give to the transform."""
