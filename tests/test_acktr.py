@@ -9,11 +9,9 @@ from algorithms.acktr import ACKTR
 from algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
 from ppo_drbpn import collect, train_rollout
 from recipe_tools import assembled, assert_same_run, read_table, resume, run
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.ppo import add_advantages
-from training.state import Training
 
 SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.steps=3")
 
@@ -26,7 +24,7 @@ def acktr(tmp_path_factory):
     return folder
 
 
-def rollout_of(*overrides: str) -> tuple[Training, TensorDictBase]:
+def rollout_of(*overrides):
     """A freshly assembled training and its first rollout, with advantages."""
     training, _ = assembled(*SMOKE, *overrides)
     assert isinstance(training.algorithm, ACKTR)
@@ -116,17 +114,17 @@ def generator():
     return torch.Generator().manual_seed(0)
 
 
-def normal(generator: torch.Generator, *shape: int) -> Tensor:
+def normal(generator, *shape):
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
-def white_noise(generator: torch.Generator, samples: int, components: int) -> Tensor:
+def white_noise(generator, samples, components):
     """Noise whose second moments over the samples are the identity to the last digits."""
     q, _ = torch.linalg.qr(normal(generator, samples, components))
     return q * samples**0.5
 
 
-def network(generator: torch.Generator, *sizes: int) -> nn.Sequential:
+def network(generator, *sizes):
     """A tanh network in float64; the last layer is linear."""
     layers: list[nn.Module] = []
     for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
@@ -136,12 +134,12 @@ def network(generator: torch.Generator, *sizes: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def flat(weight: Tensor, bias: Tensor) -> Tensor:
+def flat(weight, bias):
     """Weight and bias as one vector, column after column: kron(A, G) acts on it."""
     return torch.cat([weight, bias[:, None]], 1).T.reshape(-1)
 
 
-def observe(optimizer: KFAC, module: nn.Module, inputs: Tensor, score: Tensor) -> Tensor:
+def observe(optimizer, module, inputs, score):
     with optimizer.recording():
         output = module(inputs)
     optimizer.observe(output, score)
@@ -271,18 +269,3 @@ def test_a_step_before_any_curvature_is_refused(generator):
 def test_other_layers_are_refused_by_name(module, line):
     with pytest.raises(ValueError, match=f"`module` must hold linear layers.*{line}"):
         KFAC(module, **NUMBERS)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "line"),
-    [
-        ("lr", 0.0, "`lr` must be positive, got 0.0"),
-        ("damping", 0.0, "`damping` must be positive"),
-        ("max_kl", -1.0, "`max_kl` must be positive"),
-        ("momentum", 1.0, r"`momentum` must lie in \[0, 1\), got 1.0"),
-        ("decay", -0.1, r"`decay` must lie in \[0, 1\)"),
-    ],
-)
-def test_numbers_without_sense_are_refused(name, value, line):
-    with pytest.raises(ValueError, match=line):
-        KFAC(nn.Linear(2, 2), **{**NUMBERS, name: value})

@@ -4,13 +4,12 @@ import importlib
 import sys
 
 import pytest
-from evaluation.points import missingness_kind, missingness_name
+from evaluation.points import missingness_name
 from evaluation_tools import ROOT, configured
 from omegaconf import OmegaConf
 from recipe_tools import CONF, assembled, command, make_config, refused
 from training.config import choice
 from training.config import command as run_command
-from training.envs import env_name
 from training.errors import UserError
 from training.run_folder import load_config, read_config, resumed_config, write_config
 
@@ -43,14 +42,6 @@ def test_what_is_composed_is_built(words):
     data = training.collector.rollout()
     assert data.shape == (8, config.collector.steps_per_env)
     assert data["normalized_observation"].isfinite().all()
-
-
-def test_overlays_can_be_combined_and_the_command_line_wins():
-    config = make_config("experiment=[paper,clean]", "env=hopper")
-    assert env_name(config) == "Hopper-v4"
-    assert (missingness_kind(config.missingness), config.noise.sigma) == ("none", 0.0)
-    assert (config.optim.minibatches, config.loss.normalize) == (32, "step")
-    assert make_config("experiment=paper", "optim.minibatches=16").optim.minibatches == 16
 
 
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)

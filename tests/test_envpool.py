@@ -113,24 +113,6 @@ def test_contact_forces_are_computed_in_version_4_too():
     assert seen[..., 376 - 84 : 376].any()  # the last 14 x 6 components
 
 
-@pytest.mark.parametrize("env_id", TASKS)
-def test_first_observations_have_gymnasiums_distribution(env_id):
-    # 1500 each: mean and standard deviation of every component within 5 standard errors.
-    rows, times = 50, 30
-    draws = []
-    for cls in (EnvPoolBatchEnv, GymnasiumBatchEnv):
-        env = cls(env_id, rows, seed=1, dtype=torch.float64)
-        draws.append(torch.cat([env.reset()["observation"] for _ in range(times)]))
-    seen, expected = draws
-    n, deviation = rows * times, expected.std(0)
-    margin = 5 * deviation * (2 / n) ** 0.5 + 1e-9
-    assert ((seen.mean(0) - expected.mean(0)).abs() <= margin).all()
-    # The variance of a sample variance is (kurtosis - 1) sigma^4 / n.
-    fourth = (expected - expected.mean(0)).pow(4).mean(0)
-    spread = (fourth - deviation.pow(4)).clamp_min(0).mul(2 / n).sqrt()
-    assert ((seen.var(0) - expected.var(0)).abs() <= 5 * spread + 1e-9).all()
-
-
 def test_an_episode_that_terminates_on_the_last_step_of_the_limit_does_both():
     push, length = torch.full((60, 1, 1), 3.0), 60
     for _ in range(2):  # the second time with the limit on the step of the termination
@@ -203,18 +185,6 @@ def test_a_seed_is_used_once_and_asks_for_a_reset_of_every_row():
         with pytest.raises(RuntimeError, match="row 1 was stepped before its first reset"):
             env.step(root)
     torch.testing.assert_close(env.reset(seed=0)["observation"], first, rtol=0, atol=0)
-
-
-def test_the_state_can_not_be_saved_and_that_is_said():
-    env = EnvPoolBatchEnv("Hopper-v5", 2, seed=0)
-    env.reset()
-    assert not env.supports_state
-    assert not any(env.state_dict().values())
-    env.load_state_dict(env.state_dict())
-    other = GymnasiumBatchEnv("Hopper-v5", 2, seed=0)
-    other.reset()
-    with pytest.raises(RuntimeError, match=r"can not be restored.*EnvPool.*`supports_state`"):
-        env.load_state_dict(other.state_dict())
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

@@ -20,10 +20,7 @@ def test_every_task_passes_check_env_specs(backend, env_id):
     check_env_specs(backend(env_id, 2, seed=0), break_when_any_done="both")
 
 
-def test_specs_hold_for_every_way_of_ending_a_rollout(backend):
-    env = backend("InvertedPendulum-v5", 3, seed=0, max_episode_steps=2)
-    for end in (True, False, "any", "all", "both"):
-        check_env_specs(TransformedEnv(env, StepCounter()), break_when_any_done=end)
+def test_a_rollout_through_ends_is_consistent(backend):
     env = backend("InvertedPendulum-v5", 3, seed=0)
     rollout_consistency_assertion(env.rollout(60, break_when_any_done=False), done_strict=True)
 

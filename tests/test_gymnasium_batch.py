@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import sys
 import warnings
 from functools import partial
 
@@ -15,7 +14,7 @@ from env_tools import TASKS, play, random_actions
 from gymnasium import spaces
 from torchrl.envs import check_env_specs
 
-from torchrl_drbpn import EnvPoolBatchEnv, GymnasiumBatchEnv, SimulatorError
+from torchrl_drbpn import GymnasiumBatchEnv, SimulatorError
 
 # Version 4 is tested on purpose.
 pytestmark = [
@@ -317,9 +316,3 @@ def test_spaces_that_are_not_vectors_are_refused_by_name(register, observation, 
     with pytest.raises(ValueError, match=match) as error:
         GymnasiumBatchEnv(env_id, 1)
     assert "\n" not in str(error.value)
-
-
-def test_the_environment_over_envpool_names_its_extra_where_envpool_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "envpool", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchrl-drbpn\[envpool\]'"):
-        EnvPoolBatchEnv("Walker2d-v5", 2)
