@@ -11,7 +11,7 @@ import torch
 ROOT = Path(__file__).parents[1]
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     """Build the native filter where it is not there or older than its source; optional as ever."""
     config.addinivalue_line("filterwarnings", "ignore:the filter runs in PyTorch")
     sources = [*ROOT.glob("torchrl_drbpn/csrc/*"), ROOT / "setup.py"]

@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
 
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
@@ -21,7 +19,7 @@ BACKENDS = [
 ]
 
 
-def random_actions(env: EnvBase, steps: int, seed: int = 0, scale: float = 1.0) -> torch.Tensor:
+def random_actions(env, steps, seed=0, scale=1.0):
     """Actions from a generator of our own, some of them outside the Box where scale > 1."""
     generator = torch.Generator().manual_seed(seed)
     low, high = env.action_spec.space.low, env.action_spec.space.high
@@ -29,9 +27,7 @@ def random_actions(env: EnvBase, steps: int, seed: int = 0, scale: float = 1.0) 
     return scale * (low + (high - low) * draws)
 
 
-def play(
-    env: EnvBase, tensordict: TensorDictBase, actions: torch.Tensor | list[torch.Tensor]
-) -> tuple[torch.Tensor, TensorDictBase]:
+def play(env, tensordict, actions):
     """Step with `actions`, resetting what ends.
 
     Returns what was seen, shape (steps, num_envs, obs + 3 + obs): the observation, reward,

@@ -7,13 +7,11 @@ import functools
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.errors import UserError
@@ -25,29 +23,30 @@ CONF = ROOT / "conf"
 BELIEFS = sorted(path.stem for path in (CONF / "belief").glob("*.yaml"))
 
 TIMES = ("steps_per_second", "wall_time")
+TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 # A run of seconds with a fifth of its entries missing.
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.2")
 
 
 @functools.cache
-def _composed(*overrides: str) -> DictConfig:
+def _composed(*overrides):
     return composed_config(overrides)
 
 
-def make_config(*overrides: str) -> DictConfig:
+def make_config(*overrides):
     """Compose and check the configuration that a command line gives."""
     return copy.deepcopy(_composed(*overrides))
 
 
 @contextlib.contextmanager
-def refused(line: str) -> Iterator[pytest.ExceptionInfo[UserError]]:
+def refused(line):
     """What is done inside is refused by one line in which ``line`` is found."""
     with pytest.raises(UserError, match=line) as caught:
         yield caught
     assert "\n" not in str(caught.value)
 
 
-def run(folder: Path, *overrides: str) -> int:
+def run(folder, *overrides):
     """Train as a command line does, and leave torch's generator alone."""
     from ppo_drbpn import train
 
@@ -55,7 +54,7 @@ def run(folder: Path, *overrides: str) -> int:
         return train(make_config(*overrides), folder)
 
 
-def resume(folder: Path, *overrides: str) -> int:
+def resume(folder, *overrides):
     """Go on with a run as ``resume=<folder>`` does."""
     from ppo_drbpn import train
 
@@ -64,7 +63,7 @@ def resume(folder: Path, *overrides: str) -> int:
         return train(config, folder)
 
 
-def assembled(*overrides: str) -> tuple[Any, DictConfig]:
+def assembled(*overrides):
     """Build the parts of a run, and return its configuration beside them."""
     from ppo_drbpn import assemble
 
@@ -72,7 +71,7 @@ def assembled(*overrides: str) -> tuple[Any, DictConfig]:
     return assemble(config), config
 
 
-def make_folder(folder: Path, *overrides: str) -> Path:
+def make_folder(folder, *overrides):
     """Leave a run folder with a checkpoint after one rollout with two fifths of it missing."""
     smoke = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.4", "total_frames=128")
     blind = ("evaluation.every_frames=0", "evaluation.final_episodes=0")
@@ -80,9 +79,7 @@ def make_folder(folder: Path, *overrides: str) -> Path:
     return folder
 
 
-def command(
-    script: Path | str, *words: str, cwd: Path, **env: str
-) -> subprocess.CompletedProcess[str]:
+def command(script, *words, cwd, **env):
     """Run a script of the repository as a person does."""
     return subprocess.run(
         [sys.executable, str(ROOT / script), *words],
@@ -95,29 +92,29 @@ def command(
     )
 
 
-def printed(script: Path | str, *words: str, cwd: Path, **env: str) -> str:
+def printed(script, *words, cwd, **env):
     """Return what a script that ends well has printed."""
     done = command(script, *words, cwd=cwd, **{"OMP_NUM_THREADS": "1"} | env)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
+def read_table(path):
     """Read a CSV file without the columns that tell times."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return [{k: v for k, v in row.items() if k not in TIMES} for row in rows]
 
 
-def assert_same_run(first: Path, second: Path) -> None:
+def assert_same_run(first, second):
     """Two runs left the same tables and the same last checkpoint, to the last bit."""
-    for table in ("metrics.csv", "episodes.csv", "evaluation.csv"):
+    for table in TABLES:
         assert read_table(first / table) == read_table(second / table), table
     states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
     assert differences(*states) == []
 
 
-def differences(first: Any, second: Any, path: str = "") -> list[str]:
+def differences(first, second, path=""):
     """Name every entry in which two checkpoints differ, in the last bit or in its presence."""
     if isinstance(first, Mapping) and isinstance(second, Mapping):
         found = [f"{path}/{key} only once" for key in first.keys() ^ second.keys()]

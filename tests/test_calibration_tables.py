@@ -17,7 +17,7 @@ BINS = [1, 2, 3, 6]
 READINGS = Compared("predicted", True, "reading", "arrived")
 
 
-def steps_with(observed: torch.Tensor, **more: torch.Tensor) -> dict[str, torch.Tensor]:
+def steps_with(observed, **more):
     """Steps (episodes, time, obs) of zeros beside a mask, classes by a plain loop."""
     episodes, time, obs = observed.shape
     classes = torch.zeros(observed.shape, dtype=torch.int64)
@@ -58,7 +58,7 @@ def test_errors_are_sorted_by_arrival_and_by_steps_since_last_seen():
     assert rows["running mean", "missing", "all"]["rmse"] == 0
 
 
-def known_forecasts(std: float) -> Tally:
+def known_forecasts(std):
     """Readings around forecasts with a deviation of 1, where `std` is claimed."""
     g = torch.Generator().manual_seed(0)
     shape = (40, 100, 3)

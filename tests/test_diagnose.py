@@ -14,7 +14,7 @@ from analysis.calibration_figures import outage_figure
 from analysis.calibration_tables import calibration_rows
 from beliefs import FORECAST, FORECAST_COV
 from evaluation.table import Protocol, evaluate_condition
-from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation.trained import load_trained_agent
 from evaluation_tools import diagnose, evaluate, parse
 from matplotlib.image import imread
 from omegaconf import OmegaConf
@@ -38,12 +38,12 @@ def agents(folders):
     return {name: load_trained_agent(folder) for name, folder in folders.items()}
 
 
-def tally_of(trained: TrainedAgent, **changes: Any) -> Tally:
+def tally_of(trained, **changes):
     options: dict[str, Any] = {"episodes": 3, "mode": "sampled", "seed": 4, "bins": BINS}
     return diagnosis.diagnose(trained, parse("trained", trained.settings), **(options | changes))
 
 
-def point(tally: Tally, estimate: str, entries: str) -> dict[str, torch.Tensor]:
+def point(tally, estimate, entries):
     return tally.sums[Compared(estimate, None, "truth", entries)]
 
 

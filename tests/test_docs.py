@@ -4,7 +4,6 @@ import ast
 import importlib
 import re
 import shutil
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ EQUATIONS = {2, 3, 8, 10, 11, 12, 13}
 CITATION = re.compile(r"\b[Ee]qs?\.\s+((?:\(?\d+\)?(?:,\s+|\s+and\s+)?)+)\s+\[DRBPN\]")
 
 
-def tables(page: Path) -> Iterator[list[list[str]]]:
+def tables(page):
     """The tables of a page, each as its rows of cells without the rule."""
     rows: list[list[str]] = []
     for line in [*page.read_text(encoding="utf-8").splitlines(), ""]:
@@ -39,11 +38,11 @@ def tables(page: Path) -> Iterator[list[list[str]]]:
             rows = []
 
 
-def quoted(cell: str) -> list[str]:
+def quoted(cell):
     return re.findall(r"`([^`]+)`", cell)
 
 
-def equation_rows() -> list[tuple[set[int], list[str], list[str]]]:
+def equation_rows():
     """Each row of the table of equations: its numbers, the code and the tests it names."""
     head, *rows = next(tables(DOCS / "theory.md"))
     assert head == ["equation", "what it says", "code", "tests"]
@@ -53,7 +52,7 @@ def equation_rows() -> list[tuple[set[int], list[str], list[str]]]:
     ]
 
 
-def resolve(name: str) -> Any:
+def resolve(name):
     """The object called `torchrl_drbpn.<name>`."""
     value: Any = importlib.import_module(PACKAGE.name)
     path = PACKAGE.name
@@ -66,7 +65,7 @@ def resolve(name: str) -> Any:
 
 
 @cache
-def names_of_tests(file: str) -> frozenset[str]:
+def names_of_tests(file):
     """Every test function of a file, those of its classes included."""
     text = (ROOT / "tests" / file).read_text(encoding="utf-8")
     return frozenset(re.findall(r"^ *def (test_\w+)", text, re.MULTILINE))
@@ -88,7 +87,7 @@ def test_every_equation_has_a_row_and_what_theory_names_exists():
         assert resolve(name) is not None, name
 
 
-def citations() -> list[tuple[str, str, set[int]]]:
+def citations():
     """Every docstring that cites the paper: file, name of the top-level owner, equations."""
     found = []
     for file in sorted(PACKAGE.rglob("*.py")):
@@ -146,7 +145,7 @@ def test_notation_names_the_keys_that_are_read_and_written():
         assert f"`{spelt}`" in text, key
 
 
-def slug(heading: str) -> str:
+def slug(heading):
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
@@ -164,7 +163,7 @@ def test_every_relative_link_leads_somewhere(page):
             assert anchor in map(slug, headings), f"{page.name}: {target}"
 
 
-def blocks_of(page: Path, language: str = "python") -> list[str]:
+def blocks_of(page, language="python"):
     return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 

@@ -1,13 +1,11 @@
 """Conditions of an evaluation, and the sensors that are removed."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from evaluation.conditions import default_conditions, removed_sensors
 from evaluation.sensor_choice import kept_sensors
-from evaluation.trained import TrainedAgent, load_trained_agent
+from evaluation.trained import load_trained_agent
 from evaluation_tools import configured, evaluate, parse
 from recipe_tools import refused
 
@@ -134,7 +132,7 @@ def test_each_family_changes_what_the_agent_gets(drbpn, tmp_path):
     assert mean("spikes:1:5", "log_likelihood") < mean("noise:0", "log_likelihood")
 
 
-def removed_at_random(ratio: float, trained: TrainedAgent, episodes: int, seed: int = 0) -> Any:
+def removed_at_random(ratio, trained, episodes, seed=0):
     condition = parse(f"reduction:{ratio}:random", trained.settings)
     return removed_sensors(condition, trained, episodes=episodes, reduction_seed=seed)
 

@@ -5,8 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import export as recipe
 import play
@@ -27,7 +25,7 @@ KINDS = [
 ]
 
 
-def exported(run: Path, out: Path, **changes: Any) -> Path:
+def exported(run, out, **changes):
     changes = {"steps": 60, "calls": 20} | changes
     assert recipe.run(configured("export") | {"run": str(run), "out": str(out)} | changes) == 0
     return out
@@ -94,7 +92,7 @@ def test_a_missing_package_and_a_missing_compiler_are_named(drbpn, tmp_path, mon
         exported(drbpn, tmp_path / "p.pt2")
 
 
-def walked(script: str, policy: Path) -> float:
+def walked(script, policy):
     """The return of a program of docs/deploy, which must import nothing of ours."""
     text = (DEPLOY / script).read_text()
     tree = ast.walk(ast.parse(text))
@@ -130,7 +128,7 @@ def finished(trained_run):
     return trained_run("drbpn", "evaluation.final_episodes=2")
 
 
-def save(run: Any, out: Any) -> int:
+def save(run, out):
     return save_agent.run({"run": run and str(run), "out": out and str(out)})
 
 

@@ -29,13 +29,13 @@ ALLOWED = {
 }
 
 
-def room_of(file: Path) -> str:
+def room_of(file):
     """The folder under the package that a file belongs to; "" for the package itself."""
     parts = file.relative_to(PACKAGE).parts
     return parts[0] if len(parts) > 1 else ""
 
 
-def imports(file: Path) -> list[tuple[str, str]]:
+def imports(file):
     """Every import of a file, also inside functions, as (module, name); name "" for `import x`."""
     found = []
     package = (PACKAGE.name, *file.relative_to(PACKAGE).parent.parts)
@@ -49,7 +49,7 @@ def imports(file: Path) -> list[tuple[str, str]]:
     return found
 
 
-def reached(module: str, name: str) -> str | None:
+def reached(module, name):
     """The room that an import of the package reaches, "" for the package itself, None outside."""
     first, _, rest = module.partition(".")
     if first != PACKAGE.name:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -19,7 +18,7 @@ from PIL import Image
 from recipe_tools import refused
 from rendering import trajectory
 from rendering.belief_figure import ABSENT, BELIEF, MISSING, chosen_sensors
-from rendering.trajectory import Camera, Recording, record_episode
+from rendering.trajectory import Camera, record_episode
 from rendering.video import Film, write_video
 
 # Small, and without the robot: rendering needs what a machine may lack.
@@ -31,12 +30,12 @@ def recording(drbpn):
     return record(drbpn)
 
 
-def show(folder: Path, out: Path | None, **changes: Any) -> int:
+def show(folder, out, **changes):
     paths = {"run": str(folder), "out": out and str(out)}
     return play.run(configured("play") | paths | SMALL | changes)
 
 
-def record(folder: Path, point: str = "mcar:0.5", **changes: Any) -> Recording:
+def record(folder, point="mcar:0.5", **changes):
     """Record the episode that :func:`show` shows."""
     trained = load_trained_agent(folder)
     condition = parse(point, trained.settings)
@@ -45,17 +44,17 @@ def record(folder: Path, point: str = "mcar:0.5", **changes: Any) -> Recording:
     return record_episode(trained, condition, removed, **options)
 
 
-def near(pixels: np.ndarray, colour: str, tolerance: float = 25) -> np.ndarray:
+def near(pixels, colour, tolerance=25):
     """Where pixels have a colour, up to the palette of a GIF."""
     return np.abs(pixels.astype(float) - 255 * np.array(to_rgb(colour))).max(-1) < tolerance
 
 
-def make_film(recording: Recording, **changes: Any) -> Film:
+def make_film(recording, **changes):
     options = {"steps": range(len(recording.steps)), "window": 4, "width": 640, "title": "x"}
     return Film(recording, [0, 1], **options | changes)
 
 
-def pixels_of(film: Film, panel: int, row: float, window: int = 4) -> tuple[Any, Any]:
+def pixels_of(film, panel, row, window=4):
     """Row and columns of the middles of the steps of a panel, at a share of its height."""
     box = film.axes[panel].get_window_extent()
     columns = box.x0 + box.width * (np.arange(window) + 0.5) / window
@@ -204,7 +203,7 @@ def test_the_robot_is_drawn_where_this_machine_can_and_else_one_line_says_why(
 class Dial(PendulumEnv):
     """A pendulum that draws its angle as a shade: Gymnasium's picture needs a package more."""
 
-    def render(self) -> np.ndarray:
+    def render(self):
         return np.full((4, 4, 3), int(100 * self.state[0]), dtype=np.uint8)
 
 

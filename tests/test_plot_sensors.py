@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,7 +11,7 @@ import plot_sensors
 import pytest
 import torch
 from analysis.sensor_figures import mean_places, random_orders
-from evaluation.sensor_choice import SensorModel, kept_sensors, learned_sensors
+from evaluation.sensor_choice import kept_sensors, learned_sensors
 from evaluation.trained import load_trained_agent
 from matplotlib.image import imread
 from omegaconf import OmegaConf
@@ -50,7 +49,7 @@ def models(agents):
     return [learned_sensors(trained) for trained in agents]
 
 
-def filtered(model: SensorModel, rows: list[int]) -> torch.Tensor:
+def filtered(model, rows):
     """The covariance that the library's update leaves with these sensors."""
     observed = torch.zeros(OBS, dtype=torch.bool)
     observed[rows] = True
@@ -139,7 +138,7 @@ def test_mean_places_count_from_one(models):
 FILES = ["observation_covariance.png", "sensor_ranking.csv", "sensor_ranking.png"]
 
 
-def draw(run: Any, out: Path | None, **changes: Any) -> int:
+def draw(run, out, **changes):
     base = {"run": run, "out": out and str(out), "correlation": True, "orders": 20, "seed": 0}
     return plot_sensors.run(base | {"dpi": 50} | changes)
 

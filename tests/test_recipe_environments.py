@@ -2,22 +2,20 @@
 
 import shutil
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
 from contract_environments import ACTION, OBS, StaircaseEnv
 from ppo_drbpn import train_rollout
-from recipe_tools import SMOKE, assembled, differences, read_table, refused, resume, run
-from tensordict import TensorDict
+from recipe_tools import SMOKE, TABLES, assembled, differences, read_table, refused, resume, run
 from torchrl.data import Binary, Bounded
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs import GymEnv
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.envs import make_torchrl_env
 from training.errors import EnvironmentFault
 
 
-def made(make: Any, num_envs: int = 3, keys: tuple[str, ...] = ("observation",)) -> TransformedEnv:
+def made(make, num_envs=3, keys=("observation",)):
     return make_torchrl_env(
         id="mine", version=None, make=make, num_envs=num_envs, parallel=False, observation_keys=keys
     )
@@ -52,14 +50,14 @@ def test_what_can_not_be_trained_is_one_line(make, num_envs, keys, message):
 class MaskingEnv(StaircaseEnv):
     """Component i arrives at the steps that i + 1 divides; elsewhere a number that is none."""
 
-    def __init__(self, batch: int) -> None:
+    def __init__(self, batch):
         super().__init__(batch, horizon=7)
         spec = self.observation_spec.clone()
         spec["mask"] = Binary(shape=(batch, OBS), dtype=torch.bool)
         self.observation_spec = spec
         self.action_spec = Bounded(-1.0, 1.0, shape=(batch, ACTION), dtype=torch.float32)
 
-    def _observe(self) -> TensorDict:
+    def _observe(self):
         data = super()._observe()
         data["mask"] = self.time[:, None] % torch.arange(1, OBS + 1) == 0
         return data.set("observation", data["observation"].where(data["mask"], -9e3))
@@ -112,7 +110,7 @@ def half(tmp_path_factory):
 
 def test_one_seed_gives_one_result_whatever_the_threads(half, tmp_path):
     run(tmp_path / "again", *ENVPOOL, "total_frames=256", "env.num_threads=2")
-    for table in ("metrics.csv", "episodes.csv", "evaluation.csv"):
+    for table in TABLES:
         assert read_table(half / table) == read_table(tmp_path / "again" / table), table
 
 

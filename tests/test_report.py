@@ -2,8 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,7 +25,7 @@ STUDIES = sorted(path.parent for path in (ROOT / "results").glob("*/runs.csv"))
 WRITTEN = ("summary.csv", "aggregate.csv", "comparison.csv", "README.md")
 
 
-def episodes(returns: dict[str, tuple[float, ...]], mode: str = "sampled") -> list[dict[str, Any]]:
+def episodes(returns, mode="sampled"):
     """Rows of recipes/evaluate.py: of two episodes of a point the second is three times as long."""
     return [
         {"frames": 400, "point": point, "mode": mode, "episode": i, "return": value}
@@ -40,14 +38,7 @@ def episodes(returns: dict[str, tuple[float, ...]], mode: str = "sampled") -> li
 HOPPER = ("env=hopper", "env.version=v4", "total_frames=400")
 
 
-def make_run(
-    folder: Path,
-    *overrides: str,
-    seed: int = 0,
-    final: float = 50.0,
-    frames: list[int] = FRAMES,
-    points: dict[str, tuple[float, ...]] | None = None,
-) -> Path:
+def make_run(folder, *overrides, seed=0, final=50.0, frames=FRAMES, points=None):
     """Write what a run leaves behind."""
     folder.mkdir(parents=True)
     write_config(folder, OmegaConf.merge(make_config(*HOPPER, *overrides), {"seed": seed}))
@@ -70,17 +61,17 @@ def make_run(
     return folder
 
 
-def report(folders: list[Path] | str, out: Path, **options: Any) -> str:
+def report(folders, out, **options):
     wanted = folders if isinstance(folders, str) else [str(folder) for folder in folders]
     assert run(ASKED | {"run": wanted, "out": str(out)} | options) == 0
     return (out / "README.md").read_text()
 
 
-def tables(folders: list[Path], further: str | None = None) -> dict[str, Any]:
+def tables(folders, further=None):
     return derived_tables(read_runs(folders, further), "drbpn")
 
 
-def row(table: Any, point: str, mode: str = "sampled", **where: Any) -> Any:
+def row(table, point, mode="sampled", **where):
     for name, value in ({"point": point, "mode": mode} | where).items():
         table = table[table[name] == value]
     assert len(table) == 1, (point, mode, where, table)

@@ -10,13 +10,13 @@ import shutil
 import signal
 import threading
 import time
-from pathlib import Path
 
 import ppo_drbpn
 import pytest
 import torch
 from recipe_tools import (
     SMOKE,
+    TABLES,
     assembled,
     assert_same_run,
     make_config,
@@ -30,7 +30,7 @@ from training.errors import UserError
 from training.run_folder import Table, read_config
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {str(p): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
@@ -181,9 +181,6 @@ def test_a_checkpoint_of_another_shape_is_refused(smoke, overrides):
     training, _ = assembled(*SMOKE, *overrides)
     with refused("does not fit the settings of this run"):
         training.load_state_dict(state, "there")
-
-
-TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.cell_sweeper import CellSweeper, continued, run_cell
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from ppo_drbpn import train
 from recipe_tools import (
     CONF,
@@ -46,13 +45,13 @@ LONG = (
 )
 
 
-def compose(words: Sequence[str]) -> DictConfig:
+def compose(words):
     """Compose a configuration, what Hydra says of its job included."""
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         return hydra.compose("config", list(words), return_hydra_config=True)
 
 
-def cells(study: str, *words: str) -> list[DictConfig]:
+def cells(study, *words):
     """Compose the first cell of ``--multirun study=... <words>``, and those one word apart."""
     base = compose([f"study={study}", *words])
     params = [f"{key}={value}" for key, value in base.hydra.sweeper.params.items()]
@@ -63,18 +62,18 @@ def cells(study: str, *words: str) -> list[DictConfig]:
     return [compose(each) for each in near]
 
 
-def folder_of(cell: DictConfig) -> Path:
+def folder_of(cell):
     HydraConfig.instance().set_config(cell)
     return Path(cell.hydra.sweep.dir) / cell.hydra.sweep.subdir
 
 
-def keys(node: Any, path: str = "") -> set[str]:
+def keys(node, path=""):
     if not isinstance(node, dict):
         return {path}
     return {path}.union(*(keys(node[key], f"{path}.{key}") for key in node if key != "hydra"))
 
 
-def assert_no_unknown_key(config: DictConfig) -> None:
+def assert_no_unknown_key(config):
     """An overlay may add a key by a slip of the pen; what the groups hold is all that is read."""
     choices = config.hydra.runtime.choices
     names = sorted(path.name for path in CONF.iterdir() if path.is_dir())
@@ -83,7 +82,7 @@ def assert_no_unknown_key(config: DictConfig) -> None:
 
 
 @functools.cache
-def _keys(groups: tuple[str, ...]) -> set[str]:
+def _keys(groups):
     return keys(OmegaConf.to_container(compose(groups)))
 
 
@@ -176,7 +175,7 @@ def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_othe
         assert run_cell(broken, tmp_path / "cell") == ("cell", "stopped")
 
 
-def sweep(folder: Path, rates: str, launcher: str = "basic") -> subprocess.CompletedProcess[str]:
+def sweep(folder, rates, launcher="basic"):
     words = (
         f"optim.lr={rates}",
         "belief=none",
@@ -252,7 +251,7 @@ def start(tmp_path):
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def wait_for_rows(folder: Path, cells: int) -> list[Path]:
+def wait_for_rows(folder, cells):
     deadline = time.monotonic() + 240
     tables = []
     while sum(path.read_text().count("\n") > 2 for path in tables) < cells:

@@ -33,13 +33,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
-from recipe_tools import ROOT, differences, make_config, read_table, resume, run
+from recipe_tools import ROOT, TABLES, differences, make_config, read_table, resume, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
 from training.console import say
 from training.errors import UserError
 
-TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 SMALL = ("experiment=smoke", "total_frames=768", "checkpoint.every_frames=128",
          "missingness=mcar", "missingness.eta=0.3")  # fmt: skip
 DVRL = ("belief.num_particles=3", "belief.hidden_dim=16", "belief.latent_dim=8")
@@ -57,18 +56,10 @@ CASES = {
 }  # fmt: skip
 
 
-# Processes ------------------------------------------------------------------------------------
-
-
 class Process:
-    """A run in a fork of this process, which has imported everything and trained nothing.
+    """A run in a fork of this process with everything imported; `log` takes what it prints."""
 
-    Args:
-        job: what it does.
-        log: takes what it prints.
-    """
-
-    def __init__(self, job: Callable[[], int], log: Path) -> None:
+    def __init__(self, job, log):
         self.log, self.started = log, time.perf_counter()
         sys.stdout.flush()
         self.pid = os.fork()
@@ -85,7 +76,7 @@ class Process:
         finally:
             os._exit(status)
 
-    def ends(self, seconds: float = float("inf")) -> int | None:
+    def ends(self, seconds=float("inf")):
         """Wait for its end; kill it after some seconds. Return its status; None where killed."""
         while time.perf_counter() - self.started < seconds:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
@@ -96,13 +87,13 @@ class Process:
         os.waitpid(self.pid, 0)
         return None
 
-    def is_one_line(self) -> bool:
+    def is_one_line(self):
         """Return whether it ended in one line of an error."""
         text = self.log.read_text(errors="replace")
         return text.count("error: ") == 1 and "Traceback" not in text
 
 
-def starts(folder: Path, words: tuple[str, ...]) -> Callable[[], int]:
+def starts(folder, words):
     """Return the job that starts a run, or goes on with it where it has got to a checkpoint."""
     if folder.exists() and checkpoint_frames(folder) is None:
         shutil.rmtree(folder)
@@ -111,7 +102,7 @@ def starts(folder: Path, words: tuple[str, ...]) -> Callable[[], int]:
     return lambda: run(folder, *SMALL, *words)
 
 
-def finished(folder: Path, words: tuple[str, ...]) -> float:
+def finished(folder, words):
     """Take a run to its end; return how long that took."""
     process = Process(starts(folder, words), folder.with_suffix(".log"))
     status = process.ends()
@@ -120,22 +111,19 @@ def finished(folder: Path, words: tuple[str, ...]) -> float:
     return time.perf_counter() - process.started
 
 
-def unequal(first: Path, second: Path) -> list[str]:
+def unequal(first, second):
     """Name what differs in two runs that have ended."""
     found = [t for t in TABLES if read_table(first / t) != read_table(second / t)]
     states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
     return found + differences(*states)
 
 
-def progress(text: str) -> None:
+def progress(text):
     """Print how far a class has got."""
     print(f"  {text}", file=sys.stderr, flush=True)  # noqa: T201
 
 
-# Classes --------------------------------------------------------------------------------------
-
-
-def kills(work: Path, draw: random.Random, count: int) -> list[str]:
+def kills(work, draw, count):
     """Kill runs of every belief and algorithm at random moments."""
     wrong, stages, cases = [], Counter[str](), list(CASES.items())[: max(2, count // 6)]
     for number, (name, words) in enumerate(cases):
@@ -165,10 +153,10 @@ def kills(work: Path, draw: random.Random, count: int) -> list[str]:
     return wrong
 
 
-def sweep(work: Path, draw: random.Random, count: int) -> list[str]:
+def sweep(work, draw, count):
     """Kill a sweep and its cells; the same command goes on."""
 
-    def command(folder: Path) -> subprocess.Popen[bytes]:
+    def command(folder):
         words = ["study=smoke", f"hydra.sweep.dir={folder}"]
         log = folder.with_suffix(".log").open("ab")
         recipe = str(ROOT / "recipes" / "ppo_drbpn.py")
@@ -202,7 +190,7 @@ def sweep(work: Path, draw: random.Random, count: int) -> list[str]:
     return wrong
 
 
-def full_disk(work: Path, draw: random.Random, count: int) -> list[str]:
+def full_disk(work, draw, count):
     """Let no file grow beyond a random size, in a run that goes on from its middle."""
     straight, seed = work / "disk-straight", work / "disk-seed"
     finished(straight, CASES["drbpn"])
@@ -214,7 +202,7 @@ def full_disk(work: Path, draw: random.Random, count: int) -> list[str]:
         folder = shutil.copytree(seed, work / f"disk-{number}")
         limit = draw.randrange(5000, size)  # what it says needs room too
 
-        def job(folder: Path = folder, limit: int = limit) -> int:
+        def job(folder=folder, limit=limit):
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
             return resume(folder)
 
@@ -235,7 +223,7 @@ def full_disk(work: Path, draw: random.Random, count: int) -> list[str]:
     return wrong
 
 
-def flipped_bits(work: Path, draw: random.Random, count: int) -> list[str]:
+def flipped_bits(work, draw, count):
     """Flip a bit of a checkpoint, with its sum beside it and without."""
     folder = work / "bits"
     finished(folder, CASES["drbpn"])
@@ -266,7 +254,7 @@ def flipped_bits(work: Path, draw: random.Random, count: int) -> list[str]:
     return wrong
 
 
-def planted(work: Path, draw: random.Random, count: int) -> list[str]:
+def planted(work, draw, count):
     """Put files into a run folder that do not belong there, and go on with the run."""
     del draw
     straight, seed = work / "plant-straight", work / "plant-seed"
@@ -274,17 +262,17 @@ def planted(work: Path, draw: random.Random, count: int) -> list[str]:
     shutil.copytree(straight, seed)
     last_checkpoint(seed).unlink()
 
-    def file_for_folder(folder: Path) -> None:
+    def file_for_folder(folder):
         shutil.rmtree(folder / "checkpoints")
         (folder / "checkpoints").write_text("no folder")
 
-    def cut(name: str, size: int) -> Callable[[Path], None]:
+    def cut(name, size):
         return lambda folder: os.truncate(folder / name, size)
 
-    def writes(name: str, data: bytes) -> Callable[[Path], object]:
+    def writes(name, data):
         return lambda folder: (folder / name).write_bytes(data)
 
-    def folder_for(name: str) -> Callable[[Path], None]:
+    def folder_for(name):
         return lambda folder: ((folder / name).unlink(), (folder / name).mkdir())[1]
 
     latest = last_checkpoint(seed).relative_to(seed)
@@ -342,7 +330,7 @@ CLASSES = {
 }
 
 
-def main() -> int:
+def main():
     """Run every class; return the status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
