@@ -26,6 +26,8 @@ class BeliefModuleRefusals(BeliefFrames):
             ({"in_keys": {"obs": "a"}}, "`in_keys` names"),
             ({"in_keys": {"is_init": None}}, r"must name \['is_init'\]"),
             ({"in_keys": ["x", "x", "a", "i"]}, "`in_keys` must give .* of its own: x twice"),
+            ({"in_key": "x", "in_keys": {}}, "`in_key` and `in_keys` were both given"),
+            ({"out_key": "x", "out_keys": []}, "`out_key` and `out_keys` were both given"),
             ({"out_keys": {"feature": "a"}}, "`out_keys` names"),
             ({"out_keys": {"features": "x", ("belief", "log_likelihood"): "x"}}, "x twice"),
             ({"out_keys": ["features", ("next", "rnn")]}, "`out_keys` names .*'rnn'.* in_keys"),

@@ -52,8 +52,7 @@ class BeliefModuleContract(BeliefModuleRefusals):
     def test_keys_can_be_renamed_nested_ones_included(self):
         plain, names = self.make_module(), {"observation": ("agent", "observation"), "is_init": "i"}
         named = self.make_module(in_keys=names, out_keys={"features": ("agent", "embed")})
-        names = {"observation": ("agent", "observation")}
-        short = self.make_module(in_keys=names, out_keys={"features": ("agent", "embed")})
+        short = self.make_module(in_key=("agent", "observation"), out_key=("agent", "embed"))
         frames = self.one_by_one(plain, self.make_frames((3, 4)), self.some_state(plain, (3,)))
         expected = self.as_sequence(plain, frames)["features"]
         frames = frames.exclude("features").rename_key_("observation", ("agent", "observation"))

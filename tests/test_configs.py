@@ -1,5 +1,7 @@
 """Nodes for Hydra configurations of `torchrl.trainers`."""
 
+import copy
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-import torchrl.trainers.algorithms.configs  # noqa: F401  (registers TorchRL's nodes)
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.utils import instantiate
@@ -42,6 +43,16 @@ REQUIRED: dict[str, dict[str, Any]] = {
     "linear_gaussian_emission": {"obs_dim": 2, "state_dim": 2, "action_dim": 1},
     "particle_filter": {"obs_dim": 2, "action_dim": 1},
 }  # what a constructor requires
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _own_store():
+    """TorchRL's nodes have names of the recipe's groups: no other test may meet them."""
+    store = ConfigStore.instance()
+    before, store.repo = store.repo, copy.deepcopy(store.repo)
+    importlib.import_module("torchrl.trainers.algorithms.configs")
+    yield
+    store.repo = before
 
 
 def nodes():

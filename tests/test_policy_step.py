@@ -167,7 +167,7 @@ def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
 
 
 def test_a_normalised_policy_is_one_step_with_its_statistics():
-    belief, head = make("innovation", in_keys={"observation": "normalized_observation"})
+    belief, head = make("innovation", in_key="normalized_observation")
     norm, (observation, observed, _) = MaskedObservationNorm(OBS), inputs(OBS)
     rollout = TensorDict(observation=3 * observation + 5, observed=observed)
     rollout.batch_size = [TIME, BATCH]

@@ -124,11 +124,28 @@ def wrapped_twice(first, second):
     return TransformedEnv(TransformedEnv(StaircaseEnv(), first), second, auto_unwrap=False)
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (FillLastObserved, MISSING, "`FillLastObserved` stands before `ObservationMissingness`"),
+        (FillLastObserved, ObservedFromNaN, "`FillLastObserved` stands before `ObservedFromNaN`"),
+        (NOISE, partial(MISSING, complete_key=COMPLETE), "has corrupted the observation before"),
+        (
+            partial(NOISE, complete_key=COMPLETE),
+            partial(SPIKES, in_keys="other", complete_key=COMPLETE),
+            "`complete_observation` is among the observations of the environment already",
+        ),
+    ],
+    ids=["fill", "fill NaN", "complete", "two writers"],
+)
 @pytest.mark.parametrize("put_together", [staircase, nested, appended, inserted, wrapped_twice])
-def test_a_second_writer_of_a_key_is_refused_at_the_first_use(put_together):
-    spikes = SPIKES(in_keys="other", complete_key=COMPLETE)
-    pair = Copy(), Compose(NOISE(complete_key=COMPLETE), spikes)
-    message = "`complete_observation` is among the observations of the environment already"
+def test_a_wrong_order_is_refused_at_the_first_use(before, after, message, put_together):
+    if "already" in message:
+        pair = Copy(), Compose(before(), after())
+    elif "Fill" in message:
+        pair = Compose(SensorReduction([0]), before()), after()
+    else:
+        pair = before(), after()
     with pytest.raises(ValueError, match=message):
         put_together(*pair).rollout(2)
 

@@ -36,6 +36,8 @@ class BeliefFilterModule(RecurrentBeliefModule):
 
     Args:
         filter: the filter.
+        in_key, out_key: the key of the observation, of the features, when every other keeps its
+            name.
         in_keys: the entries read, in the order ``observation, observed, previous_action, is_init,
             ("recurrent", "mean"), ("recurrent", "cov") where there is one, ("recurrent", "age")``:
             a list of the first four or of all, or a dict from these names to yours. None in the
@@ -72,7 +74,9 @@ class BeliefFilterModule(RecurrentBeliefModule):
         self,
         filter: BeliefFilter,
         *,
+        in_key: NestedKey | None = None,
         in_keys: Keys = None,
+        out_key: NestedKey | None = None,
         out_keys: Keys = None,
         policy_input: Literal["mean", "mean_cov"] = "mean",
         default_recurrent_mode: bool | None = None,
@@ -83,8 +87,9 @@ class BeliefFilterModule(RecurrentBeliefModule):
         if filter.covariance == "propagated":
             state["recurrent", "cov"] = (filter.state_dim, filter.state_dim)
         super().__init__(
-            filter, state, _DEFAULT, _OPTIONAL, in_keys, out_keys, default_recurrent_mode
-        )
+            filter, state, _DEFAULT, _OPTIONAL, in_key, in_keys, out_key, out_keys,
+            default_recurrent_mode,
+        )  # fmt: skip
         self.policy_input = policy_input
 
     @dispatch

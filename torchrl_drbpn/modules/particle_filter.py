@@ -3,6 +3,7 @@
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
 
 from torchrl_drbpn.modules.particle_model import ParticleFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
@@ -48,7 +49,9 @@ class ParticleFilterModule(RecurrentBeliefModule):
         self,
         filter: ParticleFilter,
         *,
+        in_key: NestedKey | None = None,
         in_keys: Keys = None,
+        out_key: NestedKey | None = None,
         out_keys: Keys = None,
         default_recurrent_mode: bool | None = None,
     ) -> None:
@@ -58,8 +61,9 @@ class ParticleFilterModule(RecurrentBeliefModule):
             ("recurrent", "log_weight"): (count,),
         }
         super().__init__(
-            filter, state, _DEFAULT, _OPTIONAL, in_keys, out_keys, default_recurrent_mode
-        )
+            filter, state, _DEFAULT, _OPTIONAL,
+            in_key, in_keys, out_key, out_keys, default_recurrent_mode,
+        )  # fmt: skip
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -57,15 +57,22 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         state: Mapping[NestedKey, tuple[int, ...]],
         outputs: Sequence[NestedKey],
         optional: Sequence[NestedKey],
+        in_key: NestedKey | None,
         in_keys: Keys,
+        out_key: NestedKey | None,
         out_keys: Keys,
         default_recurrent_mode: bool | None,
     ) -> None:
         super().__init__()
         self.filter = filter
         self._default_recurrent_mode, self._warned = default_recurrent_mode, False
+        for name, one, several in (("in_key", in_key, in_keys), ("out_key", out_key, out_keys)):
+            if one is not None and several is not None:
+                raise ValueError(f"`{name}` and `{name}s` were both given: pass one of them.")
         names = (*_SOURCES, *state, _AGE)
-        if in_keys is not None and not isinstance(in_keys, Mapping):
+        if in_key is not None:
+            in_keys = {"observation": in_key}
+        elif in_keys is not None and not isinstance(in_keys, Mapping):
             listed = _as_keys("in_keys", in_keys)
             if len(listed) not in (len(_SOURCES), len(names)):
                 raise ValueError(
@@ -82,7 +89,9 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         self._state = {self._in[name]: shape for name, shape in {**state, _AGE: (1,)}.items()}
         self._next = [unravel_key(("next", key)) for key in self._state]
         if out_keys is None:
-            out_keys = {name: name for name in outputs}
+            out_keys = {name: name for name in outputs} | {
+                outputs[0]: outputs[0] if out_key is None else out_key
+            }
         elif not isinstance(out_keys, Mapping):
             listed = _as_keys("out_keys", out_keys)
             out_keys = {key: key for key in listed if key not in self._next}

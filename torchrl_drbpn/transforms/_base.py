@@ -1,8 +1,9 @@
-"""What the transforms share: keys, numbers, specs, and the frame of those that corrupt."""
+"""What the transforms share: keys, numbers, specs, order, and the frame of those that corrupt."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import Any, ClassVar, NamedTuple, TypeAlias, TypedDict
 
 import torch
@@ -219,6 +220,9 @@ class CorruptingTransform(Transform, ABC):
     """
 
     writes_mask: ClassVar[bool] = True
+    keeps_readings: ClassVar[bool] = (
+        False  # what it reads is still complete for a transform after it
+    )
     # attributes that hold one number for all components, or one for each
     per_component: ClassVar[tuple[str, ...]] = ()
     out_keys: list[NestedKey]
@@ -312,6 +316,7 @@ class CorruptingTransform(Transform, ABC):
     # ------------------------------------------------------------------------------------- specs
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Widen the observation, enter its mask and, on request, the complete observation."""
+        self._check_order()
         spec = observation_spec.clone()
         self._check(spec)
         for key, mask_key, complete_key in (row for vector in self._vectors for row in vector):
@@ -322,6 +327,24 @@ class CorruptingTransform(Transform, ABC):
                 spec[mask_key] = Binary(shape=leaf.shape, device=leaf.device, dtype=torch.bool)
             spec[key] = Unbounded(leaf.shape, leaf.device, leaf.dtype)
         return spec
+
+    def _check_order(self) -> None:
+        name, keys = type(self).__name__, set(self.in_keys)
+        for earlier in takewhile(lambda part: part is not self, chain_of(self)):
+            other = type(earlier).__name__
+            if keys.isdisjoint([*earlier.in_keys, *earlier.out_keys]):
+                continue
+            if self.writes_mask and getattr(earlier, "fills", False):
+                raise ValueError(
+                    f"`{other}` stands before `{name}`: what goes missing afterwards is never "
+                    f"filled. Put `{other}` after `{name}`."
+                )
+            corrupts = isinstance(earlier, CorruptingTransform) and not earlier.keeps_readings
+            if self.complete_keys and corrupts:
+                raise ValueError(
+                    f"`{name}` is asked for {self.complete_keys} but `{other}` has corrupted the "
+                    f"observation before it. Pass complete_key to `{other}` instead."
+                )
 
 
 def _join(parts: list[Tensor]) -> Tensor:

@@ -21,8 +21,8 @@ class FillLastObserved(EnvironmentTransform):
     r"""Replace missing entries by the last observed value of the same episode.
 
     filled_t = x_t where observed, filled_{t-1} elsewhere, `fill_value` before the first observed
-    value of an episode. The mask stays as it is. The last values travel in the tensordict. It
-    stands behind every transform that makes entries go missing.
+    value of an episode. The mask stays as it is. The last values travel in the tensordict. A
+    transform after it that makes entries go missing is refused with a ValueError.
 
     Args:
         in_keys: observations, shape `(*batch, obs)`, floating point.
@@ -44,6 +44,7 @@ class FillLastObserved(EnvironmentTransform):
         tensor([5., 2.])
     """
 
+    fills: ClassVar[bool] = True
     why_online: ClassVar[str] = "needs the steps before"
 
     def __init__(

@@ -244,5 +244,7 @@ class ObservedFromNaN(CorruptingTransform):
         ([1.0, 0.0], [True, False])
     """
 
+    keeps_readings: ClassVar[bool] = True
+
     def _corrupt(self, step: Step) -> tuple[Tensor, Tensor]:
         return step.observation, ~step.observation.isnan() & step.observed
