@@ -15,7 +15,6 @@ from torchrl_drbpn.functional import (
     StateSpace,
     filter_sequence,
     particle_sequence,
-    resample,
     systematic_ancestors,
 )
 from torchrl_drbpn.modules import particle_model
@@ -249,15 +248,6 @@ def test_equal_weights_keep_every_particle_and_a_zero_weight_none():
     log_weight = torch.zeros(3, 4)
     log_weight[:, [0, 3]] = -torch.inf
     assert systematic_ancestors(log_weight, uniform).tolist() == [[1, 1, 2, 2]] * 3
-
-
-def test_the_gradient_goes_to_the_ancestors_and_not_through_their_choice():
-    values = torch.arange(3.0).unsqueeze(-1).requires_grad_()
-    log_weight = torch.tensor([0.0, -torch.inf, 0.0], requires_grad=True)
-    ancestors = systematic_ancestors(log_weight, torch.tensor([0.5]))
-    resample(values, ancestors).sum().backward()
-    assert values.grad.flatten().tolist() == ancestors.bincount(minlength=3).tolist()
-    assert log_weight.grad is None
 
 
 class LinearGaussian:

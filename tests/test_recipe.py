@@ -192,9 +192,19 @@ def test_a_closed_pipe_does_not_stop_a_run(tmp_path):
     assert last_checkpoint(tmp_path / "run").name == "frames_000000000256.pt"
 
 
+def improvement(folder, *overrides):
+    """Train and return the ratio of the last to the first 20 episodes' mean return."""
+    assert run(folder, "experiment=inverted_pendulum_test", *overrides) == 0
+    returns = [float(row["return"]) for row in read_table(folder / "episodes.csv")]
+    assert len(returns) >= 40
+    return sum(returns[-20:]) / sum(returns[:20])
+
+
 @pytest.mark.slow
 def test_the_agent_learns_to_balance_with_a_fifth_of_its_sensors_missing(tmp_path):
-    assert run(tmp_path / "run", "experiment=inverted_pendulum_test") == 0
-    returns = [float(row["return"]) for row in read_table(tmp_path / "run" / "episodes.csv")]
-    assert len(returns) >= 40
-    assert sum(returns[-20:]) >= 5 * sum(returns[:20])
+    assert improvement(tmp_path / "run") >= 5
+
+
+@pytest.mark.slow
+def test_without_learning_the_returns_do_not_rise(tmp_path):
+    assert improvement(tmp_path / "run", "optim.lr=0") < 2

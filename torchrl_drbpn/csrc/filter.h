@@ -40,8 +40,6 @@ void NAME(sizes)(const int64_t *dims, int64_t *out) {
     out[0] = tape.used, out[1] = ahead.used, out[2] = back.used;
 }
 
-/* ---------------------------------------------------------------- forward */
-
 /* One step of the transition: the predicted mean into a.mean and, beside the action, predicted. */
 static void predict(const Sizes *s, const Ahead *a, const Tape *tape, long t, const given *start,
                     const given *stored, const uint8_t *use_stored, const given *action,
@@ -120,8 +118,6 @@ void NAME(forward)(const int64_t *dims, void **p) {
         else gain_innovation(s, &a, &tape, t, observed, reset, mean, ll);
     }
 }
-
-/* ---------------------------------------------------------------- backward */
 
 /* One step of the transition back, from w.layer[last] to w.by_input. */
 static void by_transition(const Sizes *s, const Back *w, const Tape *tape, long t) {

@@ -18,8 +18,6 @@ INLINE real over_lanes(vec v) {
     return sum;
 }
 
-/* ---------------------------------------------------------------- matrix products */
-
 /* C (+)= A B for ROWS x (COLS * LANES) entries of C, which stay in registers. */
 INLINE void tile(const int rows, const int cols, long inner, const real *A, long a_row, long a_in,
                  const real *B, long ldb, real *C, long ldc, real sign, int add) {
@@ -105,8 +103,6 @@ static void narrow(long n, const real *from, given *to) {
 static void give_out(long rows, long cols, const real *from, long ld, given *to) {
     for (long r = 0; r < rows; r++) narrow(cols, from + r * ld, to + r * cols);
 }
-
-/* ---------------------------------------------------------------- LANES inverses at once */
 
 /* Rows i .. i + many of column j of the factor. */
 INLINE void column(const int many, long n, long i, long j, vec *A, const vec *X) {

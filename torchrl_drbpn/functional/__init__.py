@@ -54,7 +54,6 @@ from torchrl_drbpn.functional.particles import (
     ProposalOutput,
     particle_sequence,
     particle_step,
-    resample,
     systematic_ancestors,
 )
 from torchrl_drbpn.functional.robust import innovation_weights, robust_sequence_weights
@@ -109,7 +108,6 @@ __all__ = [
     "predict",
     "predict_step",
     "propagate",
-    "resample",
     "robust_sequence_weights",
     "row_jacobian",
     "sample_delay",

@@ -135,7 +135,6 @@ def _unpacked(
     return TransitionMLP(weights, tuple(parts[1::2]), residual, "tanh" if tanh else "relu")
 
 
-# ------------------------------------------------------------------ a call of C
 class _Call:
     """One call with the operator's arguments, checked: its sizes, and how much memory it needs."""
 
@@ -224,7 +223,6 @@ def _inverses(call: _Call, covs: Sequence[Tensor]) -> tuple[list[Tensor], Tensor
     return list(inverse), 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-# ------------------------------------------------------------------ the operator
 def _forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     call, dense = _Call(arguments), _dense(arguments)
     x, observed, reset, (network, F) = dense[0], dense[1], dense[3], dense[-2:]

@@ -82,7 +82,6 @@ class ParticleOutput(NamedTuple):
     expected: Tensor
 
 
-# -------------------------------------------------------------------------------------- resampling
 @torch.no_grad()
 def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
     r"""Choose the particles that go on, by systematic resampling.
@@ -107,20 +106,6 @@ def systematic_ancestors(log_weight: Tensor, uniform: Tensor) -> Tensor:
     return torch.searchsorted(total, position, right=True).clamp_max(count - 1)
 
 
-def resample(values: Tensor, ancestors: Tensor) -> Tensor:
-    """Let each particle take over what its ancestor holds.
-
-    Values ``(*batch, particles, dim)``, int64 ancestors ``(*batch, particles)``; the gradient goes
-    to the ancestors.
-
-    Example:
-        >>> resample(torch.tensor([[1.0], [2.0], [3.0]]), torch.tensor([0, 0, 2])).tolist()
-        [[1.0], [1.0], [3.0]]
-    """
-    return values.gather(-2, ancestors.unsqueeze(-1).expand_as(values))
-
-
-# --------------------------------------------------------------------------- one step, one sequence
 def particle_step(
     model: ParticleModel,
     hidden: Tensor,
@@ -142,7 +127,8 @@ def particle_step(
     the :class:`ParticleOutput` of the step before, zeros at a start; ``observation`` and the bool
     ``observed``, True = arrived, are ``(*batch, obs)``. :func:`particle_sequence` has an example.
     """
-    hidden = resample(hidden, systematic_ancestors(log_weight, noise.resampling))
+    ancestors = systematic_ancestors(log_weight, noise.resampling)
+    hidden = hidden.gather(-2, ancestors.unsqueeze(-1).expand_as(hidden))
     proposal, transition = model.propose(hidden, inputs)
     latent = proposal.mean + proposal.variance.sqrt() * noise.proposal
     step = model.step(latent, hidden, inputs)

@@ -169,7 +169,6 @@ class BeliefFilter(nn.Module):
         saved = state_dict.get(f"{prefix}mean_jacobian")
         self._fresh = self._fresh and (saved is None or bool(saved.isnan().any()))
 
-    # ------------------------------------------------------------------ the model as tensors
     @property
     def initial_cov(self) -> Tensor:
         """Covariance of the belief before the first observation, shape ``(state, state)``."""
@@ -305,7 +304,6 @@ class BeliefFilter(nn.Module):
         with without_autocast(mean):
             return predict_step(self.state_space(), mean, previous_action, reset, cov)
 
-    # ------------------------------------------------------------------ offline
     def smooth(
         self,
         mean: Tensor,

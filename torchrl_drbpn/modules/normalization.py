@@ -116,7 +116,6 @@ class MaskedObservationNorm(TensorDictModuleBase):
             self.register_buffer(name, torch.zeros(obs_dim, dtype=kind, device=device))
         self.register_load_state_dict_pre_hook(_refuse_unusable)
 
-    # ------------------------------------------------------------------------------- on tensors
     @property
     def std(self) -> Tensor:
         """Scale sqrt(var + eps), 1 where fewer than two readings were seen, shape ``(obs,)``."""
@@ -146,7 +145,6 @@ class MaskedObservationNorm(TensorDictModuleBase):
         """Return x std + mean of deviations ``(*batch, obs)``, in units; clips are not undone."""
         return (value.double() * self.std + self.mean).to(value.dtype)
 
-    # --------------------------------------------------------------------------- on tensordicts
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the standardised observation beside what was read; a complete one may be absent."""

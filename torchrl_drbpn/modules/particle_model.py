@@ -143,7 +143,6 @@ class ParticleFilter(nn.Module):
                     nn.init.orthogonal_(block, gain)
                 nn.init.zeros_(part.bias)
 
-    # ------------------------------------------------------------------ one step, a sequence
     def forward(
         self,
         hidden: Tensor,

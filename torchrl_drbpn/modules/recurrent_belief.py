@@ -171,7 +171,6 @@ class RecurrentBeliefModule(TensorDictModuleBase):
                 stacklevel=5,  # the caller of this package
             )
 
-    # ------------------------------------------------------------------ what TorchRL looks for
     @property
     def dtype(self) -> torch.dtype:
         """Precision of the filter's parameters."""

@@ -130,7 +130,6 @@ class DRBPNLoss(LossModule):
         self.detach_belief = detach_belief
         self.register_coeff_buffer("model_coeff", model_coeff)
 
-    # ------------------------------------------------------------------ keys
     @property
     def tensor_keys(self) -> _AcceptedKeys:
         """The entries read, by the names that they have in the held losses."""
@@ -184,7 +183,6 @@ class DRBPNLoss(LossModule):
         model = [] if self.model_loss is None else self.model_loss.out_keys
         return [*self.ppo_loss.out_keys, *model]
 
-    # -------------------------------------------------------------- networks
     @property
     def reduction(self) -> str:
         """How the terms of each step are reduced: "mean", "sum" or "none"."""
@@ -239,7 +237,6 @@ class DRBPNLoss(LossModule):
         super().reset_parameters_recursive()
         self.ppo_loss.reset_parameters_recursive()
 
-    # --------------------------------------------------------------- forward
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the PPO terms, ``loss_model`` (weighted), and the metrics of both."""

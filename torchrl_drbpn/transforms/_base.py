@@ -273,7 +273,6 @@ class CorruptingTransform(Transform, ABC):
                 )
             self._check_obs_dim(sum(leaf.shape[-1] for leaf in leaves))
 
-    # ------------------------------------------------------------------------------- on tensors
     def _run(self, tensordict: TensorDictBase, before: TensorDictBase | None) -> TensorDictBase:
         if not self._checked:
             self._check(tensordict)
@@ -313,7 +312,6 @@ class CorruptingTransform(Transform, ABC):
         self._checked = False
         return self._call(tensordict)
 
-    # ------------------------------------------------------------------------------------- specs
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Widen the observation, enter its mask and, on request, the complete observation."""
         self._check_order()

@@ -63,7 +63,6 @@ class CarriedStateTransform(SeededTransform):
             )
         self.out_keys = [*self.out_keys, *self.state_keys]
 
-    # ------------------------------------------------------------------------------------ groups
     def _count(self, obs_dim: int) -> int:
         """Return how many groups there are; without `groups` every component is one."""
         return obs_dim if self.groups is None else len(self.groups)
@@ -104,7 +103,6 @@ class CarriedStateTransform(SeededTransform):
                 getattr(self, name), name, self._count(obs_dim), "group (component, without groups)"
             )
 
-    # ------------------------------------------------------------------------------------- state
     @abstractmethod
     def _layout(self, obs_dim: int) -> list[tuple[tuple[int, ...], torch.dtype | None]]:
         """Return shape behind the batch and dtype of each state; None: that of the observation."""

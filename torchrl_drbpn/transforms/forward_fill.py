@@ -109,7 +109,6 @@ class FillLastObserved(EnvironmentTransform):
                     tensordict_reset.set(key, value.masked_fill(stale, self.fill_value))
         return tensordict_reset
 
-    # ------------------------------------------------------------------------------------- specs
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Enter the filled observations and the last values, unbounded."""
         self._check(observation_spec)

@@ -96,7 +96,6 @@ class PreviousAction(EnvironmentTransform):
                 tensordict_reset.set(key, value.masked_fill(rows, 0))
         return tensordict_reset
 
-    # ------------------------------------------------------------------------------------- specs
     def _layout(self, key: NestedKey) -> tuple[tuple[int, ...], torch.device, torch.dtype]:
         """Return shape, device and dtype of the previous action."""
         leaf = read_leaf(self.parent.full_action_spec, key, self)

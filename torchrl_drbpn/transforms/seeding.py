@@ -31,7 +31,6 @@ def check_seed(seed: int, name: str = "seed") -> int:
     return int(seed)
 
 
-# ---------------------------------------------------------------------------- worker processes
 # The seed of torch's global generator as this process inherited it; None where it has its own. A
 # forked process starts with a copy of its parent's generator, so that siblings draw the same
 # numbers; a child that imports this module late is treated as forked.
@@ -58,7 +57,6 @@ def _separate_worker() -> None:
     _inherited = None
 
 
-# ------------------------------------------------------------------------------------ transform
 class SeededKeys(CorruptionKeys, total=False):
     """And the seed of those that draw."""
 
@@ -131,7 +129,6 @@ class SeededTransform(EnvironmentTransform, CorruptingTransform):
         return copy
 
 
-# ----------------------------------------------------------------------------------- environment
 def seed_env(env: EnvBase, seed: int) -> int | None:
     """Seed `env` and every transform that draws, with a seed of its own for each.
 
