@@ -108,7 +108,7 @@ def run_episodes(
     is called after every step with the episodes of the block, the stepped tensordict of these, and
     whether each was still running before the step. The global generator is left as it was found.
     """
-    gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []
+    gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []  # type: ignore[no-untyped-call]
     with torch.random.fork_rng(gpus), torch.no_grad(), set_exploration_type(_KINDS[mode]):
         for block, first in enumerate(range(0, episodes, BLOCK)):
             rows = slice(first, min(first + BLOCK, episodes))
