@@ -112,7 +112,7 @@ class RayRollouts:
             sync=True,
             frames_per_batch=self._num_envs * self._steps,
             total_frames=math.inf,
-            backend_options={"collector_kwargs": COLLECTING, "remote_configs": resources},
+            backend_options={"collector_kwargs": dict(COLLECTING), "remote_configs": resources},
         )
         self._rollouts = iter(self._collector)
 
