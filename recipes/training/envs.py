@@ -1,6 +1,7 @@
 """The environment of a run: simulators, and what happens to their observations, in conf's order."""
 
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -39,12 +40,10 @@ from training.sensors import named_sensors, sensor_groups
 
 # Written by the environment on request, read by a critic on request, by a policy never.
 COMPLETE = "complete_observation"
-# How every collector collects.
-COLLECTING: dict[str, Any] = {
-    "track_traj_ids": False,
-    "use_buffers": True,
-    "auto_register_policy_transforms": False,
-}
+# How every collector collects. Read-only: TorchRL's Ray backend writes into what it is given.
+COLLECTING: Mapping[str, Any] = MappingProxyType(
+    {"track_traj_ids": False, "use_buffers": True, "auto_register_policy_transforms": False}
+)
 
 
 def make_env(

@@ -220,9 +220,8 @@ class CorruptingTransform(Transform, ABC):
     """
 
     writes_mask: ClassVar[bool] = True
-    keeps_readings: ClassVar[bool] = (
-        False  # what it reads is still complete for a transform after it
-    )
+    # what it reads is still complete for a transform after it
+    keeps_readings: ClassVar[bool] = False
     # attributes that hold one number for all components, or one for each
     per_component: ClassVar[tuple[str, ...]] = ()
     out_keys: list[NestedKey]
