@@ -32,6 +32,7 @@ def test_a_gpu_that_is_not_here_ends_a_run_in_one_line_that_leaves_no_folder(tmp
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"error: `device={missing}` is not here: torch finds")
+    assert "Take device=cpu" in line
     assert not list(tmp_path.glob("runs/*"))
 
 

@@ -102,7 +102,10 @@ def device_named(name: str) -> torch.device:
         raise UserError(f"`device` must be cpu, cuda or cuda and a number, cuda:1, got {name!r}.")
     count = torch.cuda.device_count()
     if device.type == "cuda" and (device.index or 0) >= count:
-        raise UserError(f"`device={name}` is not here: torch finds {count} CUDA devices.")
+        raise UserError(
+            f"`device={name}` is not here: torch finds {count} CUDA devices. Take device=cpu, or a "
+            "build of torch for your GPU (pytorch.org)."
+        )
     return device
 
 
