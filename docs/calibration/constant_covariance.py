@@ -140,8 +140,12 @@ def judge(
     observed: Tensor,
     *,
     propagated: bool,
+    diagonal: bool = False,
 ) -> dict[str, Tensor]:
-    """Filter with P = Q or P = A P A' + Q, and return sums for each sequence (and class)."""
+    """Filter with P = Q or P = A P A' + Q, and return sums for each sequence (and class).
+
+    ``diagonal`` keeps the variances alone of every P: those are (A o A) P + Q then.
+    """
     rows, time = observed.shape[:2]
     A, R = dynamics(model), model.full_emission_cov()
     action, zero = torch.zeros(rows, 1, dtype=torch.float64), model.emission_offset
@@ -159,6 +163,8 @@ def judge(
             belief = predict(
                 belief, lambda m, _: m @ A.mT, Q, action, jacobian=A if propagated else None
             )
+        if diagonal:
+            belief = belief._replace(cov=belief.cov.diagonal(dim1=-2, dim2=-1).diag_embed())
         seen = observed[:, t]
         given = (observation[:, t], seen, model.emission_matrix, R, zero.expand(rows, -1))
         sums["nis"] += nis(*innovation(belief, *given), seen)

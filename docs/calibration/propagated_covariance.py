@@ -3,9 +3,10 @@
 The linear system of constant_covariance.py, its mean known; what is uncertain is learned by the
 likelihood of sequences whose sensors fail independently at every step: P of the paper's constant
 form, Q of the propagated one (P = F cov F' + Q, F and cov without gradient). Both are then tested
-where sensors fail for 20 or 50 steps on average, one by one or all at once. MSE of the state over
-that of the exact filter, NEES / n (1: as sure as it should be), plus-minus 1.96 standard errors
-over sequences. ``--quick`` only shows that it runs.
+where sensors fail for 20 or 50 steps on average, one by one or all at once; diagonal: the
+propagated one with its variances alone. MSE of the state over that of the exact filter, NEES / n
+(1: as sure as it should be), plus-minus 1.96 standard errors over sequences. ``--quick`` only
+shows that it runs.
 """
 
 from __future__ import annotations
@@ -39,8 +40,11 @@ def main(quick: bool = False) -> None:
         data = simulate(model, case, rows, time, seed=1)
         exact = judge(model, model.transition_cov, *data, propagated=True)
         row = {"NEES / n, exact": ratio(exact["nees"], exact["entries"])}
-        for label, Q in (("constant", constant), ("propagated", propagated)):
-            sums = judge(model, Q, *data, propagated=label == "propagated")
+        for label, Q in (
+            ("constant", constant), ("propagated", propagated), ("diagonal", propagated),
+        ):  # fmt: skip
+            given = {"propagated": label != "constant", "diagonal": label == "diagonal"}
+            sums = judge(model, Q, *data, **given)
             row[f"MSE over exact, {label}"] = ratio(sums["se"], exact["se"])
             row[f"NEES / n, {label}"] = ratio(sums["nees"], sums["entries"])
         found[name] = row
