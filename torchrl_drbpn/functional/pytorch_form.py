@@ -28,7 +28,7 @@ from torchrl_drbpn.functional.state_space import (
 # Chooses what belongs to P_0 or to Q, of shape (2, ...) in this order, for every step; leaves alone
 # what is there for every step.
 Choose = Callable[[Tensor], Tensor]
-Gains = tuple[Tensor, Callable[[Tensor, list[Tensor]], Tensor]]
+Gains = tuple[Tensor, Callable[[Tensor], Tensor]]
 Filtered = tuple[Tensor, Tensor | None, Tensor]  # means, covariances, log-likelihoods
 
 
@@ -52,9 +52,10 @@ def run_in_pytorch(model: StateSpace, rows: FilterInputs) -> Filtered:
     added = None if rows.weight is None else _added_noise(R, rows.weight)
     covs = torch.stack([model.full_initial_cov(), model.constant_cov()]).double()
 
+    which = (~reset).long().flatten()
+
     def choose(pair: Tensor) -> Tensor:
-        first = reset.view(*reset.shape, *(1,) * (pair.ndim - 1))
-        return torch.where(first, pair[0], pair[1])
+        return pair.index_select(0, which).view(*reset.shape, *pair.shape[1:])
 
     filtered_covs = None
     if isinstance(F := model.transition_jacobian, Tensor) and rows.cov is not None:
@@ -68,21 +69,20 @@ def run_in_pytorch(model: StateSpace, rows: FilterInputs) -> Filtered:
     gain, likelihood = gains(H, R, covs, choose, observed, added)
     # Filling before any arithmetic keeps a NaN under a False mask out of values and gradients.
     y = zero_missing(rows.observation, observed).double() - model.offset(action).double()
-    innovations, moves, filtered, H_t = [], [], [], H.mT
+    innovations, filtered, H_t = [], [], H.mT
     steps = zip(*(x.unbind(1) for x in (y, gain, action, reset.unsqueeze(-1))), strict=True)
     for t, (y_t, gain_t, action_t, reset_t) in enumerate(steps):
         mean, _ = rows.before(t, mean, None)
         m = model.predicted_mean(mean, action_t, reset_t).double()
         v = torch.addmm(y_t, m, H_t, alpha=-1)
-        move = torch.bmm(gain_t, v.unsqueeze(-1)).squeeze(-1)
-        mean = (m + move).to(dtype)
+        updated = torch.baddbmm(m.unsqueeze(-1), gain_t, v.unsqueeze(-1)).squeeze(-1)
+        mean = updated.to(dtype)
         innovations.append(v)
-        moves.append(move)
         filtered.append(mean)
     if not filtered:
         return mean.unsqueeze(1)[:, :0], filtered_covs, y.sum(-1).to(dtype)
     residual = zero_missing(torch.stack(innovations, 1), observed)
-    ll = torch.where(observed.any(-1), likelihood(residual, moves), 0.0).to(dtype)
+    ll = torch.where(observed.any(-1), likelihood(residual), 0.0).to(dtype)
     return torch.stack(filtered, 1), filtered_covs, ll
 
 
@@ -142,11 +142,10 @@ def _innovation(
     cross = H @ covs
     S = choose(cross @ H.mT + full_R)
     S = S if added is None else S + torch.diag_embed(added)
-    factor, log_det = _factor(masked_cov(S, observed))
-    gain = torch.cholesky_solve(zero_missing(choose(cross), observed.unsqueeze(-1)), factor).mT
+    factor, log_det, nan = _factor(masked_cov(S, observed))
+    gain = torch.cholesky_solve(choose(cross) * (observed + nan).unsqueeze(-1), factor).mT
 
-    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
-        del moves
+    def likelihood(residual: Tensor) -> Tensor:
         white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
         count = observed.sum(-1).to(residual.dtype)  # an integer times a float would be float32
         return -0.5 * (white.squeeze(-1).square().sum(-1) + log_det + count * LOG_2PI)
@@ -169,13 +168,13 @@ def _information(
     R = R if added is None else R + added
     weight = observed / R
     outer = (H.unsqueeze(-1) * H.unsqueeze(-2)).flatten(-2)
-    prior_factor, prior_log_det = _factor(covs)
-    prior = choose(torch.cholesky_inverse(prior_factor))
-    factor, log_det = _factor((weight @ outer).view(prior.shape) + prior)
-    gain = torch.cholesky_solve((weight.unsqueeze(-1) * H).mT, factor)
+    prior_factor, prior_log_det, nan = _factor(covs)
+    prior = choose(torch.cholesky_inverse(prior_factor) + nan.unsqueeze(-1))
+    factor, log_det, nan = _factor((weight @ outer).view(prior.shape) + prior)
+    gain = torch.cholesky_solve(((weight + nan).unsqueeze(-1) * H).mT, factor)
 
-    def likelihood(residual: Tensor, moves: list[Tensor]) -> Tensor:
-        move = torch.stack(moves, 1)
+    def likelihood(residual: Tensor) -> Tensor:
+        move = (gain @ residual.unsqueeze(-1)).squeeze(-1)
         left = zero_missing(residual - move @ H.mT, observed)
         by_prior = (prior @ move.unsqueeze(-1)).squeeze(-1)
         quadratic = (weight * left.square()).sum(-1) + (move * by_prior).sum(-1)
@@ -185,12 +184,12 @@ def _information(
     return gain, likelihood
 
 
-def _factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Return Cholesky factor and log-determinant; NaN for a matrix that has none, by itself."""
+def _factor(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return Cholesky factors, log-determinants, and ``(..., 1)`` 0, NaN for one that has none."""
     factor, info = torch.linalg.cholesky_ex(matrix)
-    spoilt = torch.where(info == 0, 0.0, torch.nan).to(matrix.dtype)[..., None, None]
-    factor = factor + spoilt
-    return factor, 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    nan = torch.where(info == 0, 0.0, torch.nan).to(matrix.dtype).unsqueeze(-1)
+    log_det = 2.0 * (factor.diagonal(dim1=-2, dim2=-1).log() + nan).sum(-1)
+    return factor, log_det, nan
 
 
 def run_step_by_step(model: StateSpace, rows: FilterInputs) -> Filtered:
