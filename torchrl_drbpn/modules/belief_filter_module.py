@@ -108,8 +108,8 @@ class BeliefFilterModule(RecurrentBeliefModule):
         else:
             time = given.reset.ndim - 1
 
-            def first(x: Tensor) -> Tensor:  # the sum of one step, or of none if there is no time
-                return x.narrow(time, 0, min(1, x.shape[time])).sum(time)
+            def first(x: Tensor) -> Tensor:  # zeros if there is no time
+                return x.select(time, 0) if x.shape[time] else x.sum(time)
 
             out = self.filter(
                 first(mean), None if cov is None else first(cov), *readings,

@@ -269,23 +269,24 @@ class DRBPNLoss(LossModule):
         keys, following = model_loss.tensor_keys, data.get("next", None)
         if following is None or following.get(keys.observed, None) is None:
             return  # without a next step nothing is added
-        last = model_loss.last_steps(data).flatten()
+        last = model_loss.last_steps(data)
         # a pass over all would cost as much as the filter; compiled, the number must not vary
         if torch.compiler.is_compiling():
-            index = torch.arange(len(last), device=last.device)
+            index = torch.unravel_index(torch.arange(last.numel(), device=last.device), last.shape)
         else:
-            index = last.nonzero().squeeze(-1)
-        if not len(index):
+            index = last.nonzero(as_tuple=True)
+        if not len(index[0]):
             return  # not every belief module takes an empty batch
         belief_keys = self.filter_network.in_keys
         # sequences of one step that continue their episode
-        steps = following.select(*belief_keys, strict=False).reshape(-1)[index].unsqueeze(1)
+        alone = tuple(x.unsqueeze(-1) for x in index)
+        steps = following.select(*belief_keys, strict=False)[alone]
         goes_on = torch.zeros(*steps.shape, 1, dtype=torch.bool, device=last.device)
         steps.set(self._own_keys.is_init, goes_on)
         self.filter_network(steps)
-        found = steps.get(keys.log_likelihood).squeeze(1)
-        everywhere = found.new_zeros(len(last)).index_put((index,), found)
-        data.set(in_next(keys.log_likelihood), everywhere.reshape(data.shape))
+        found = steps.get(keys.log_likelihood)
+        everywhere = found.new_zeros(last.shape).index_put(alone, found)
+        data.set(in_next(keys.log_likelihood), everywhere)
 
 
 class _OverSequences(TensorDictSequential):
