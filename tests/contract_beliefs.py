@@ -19,11 +19,7 @@ from contract_environments import (
 )
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.envs import (
-    Compose,
-    SerialEnv,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import GRUModule, canonicalize_rnn_subset, set_recurrent_mode
 from torchrl.modules.utils import get_primers_from_module

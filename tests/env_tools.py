@@ -5,13 +5,17 @@ import torch
 
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
-__all__ = ["BACKENDS", "TASKS", "play", "random_actions"]
-
 _NAMES = (
     "Ant HalfCheetah Hopper Humanoid InvertedDoublePendulum InvertedPendulum Reacher Swimmer "
     "Walker2d"
 )
 TASKS = [f"{name}-{version}" for name in _NAMES.split() for version in ("v4", "v5")]
+
+# Version 4 is tested on purpose.
+MARKS = [
+    pytest.mark.usefixtures("own_directory"),
+    pytest.mark.filterwarnings("ignore:.*is out of date"),
+]
 
 BACKENDS = [
     pytest.param(GymnasiumBatchEnv, id="gymnasium"),

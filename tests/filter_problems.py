@@ -2,6 +2,9 @@
 
 import itertools
 import math
+from functools import partial
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import oracles
 import pytest
@@ -26,18 +29,37 @@ SIZES = [
     pytest.param(4, 4, id="state=obs"),
     pytest.param(6, 3, id="state>obs"),
 ]
-FORMS = [
-    "pytorch",
-    pytest.param(
-        "native", marks=pytest.mark.skipif(native_status() is not None, reason="not built")
-    ),
-    "step by step",
-]
+built = pytest.mark.skipif(native_status() is not None, reason="not built")
+FORMS = ["pytorch", pytest.param("native", marks=built), "step by step"]
 TOLERANCE = 1e-10
 
 
-def assert_equal(actual, expected, tolerance=TOLERANCE):
-    torch.testing.assert_close(actual, expected, atol=tolerance, rtol=tolerance)
+def assert_equal(actual, expected, tolerance=TOLERANCE, name="value", scale=1.0):
+    limits = {"rtol": tolerance, "atol": tolerance * scale}
+    torch.testing.assert_close(actual, expected, **limits, msg=lambda text: f"{name}: {text}")
+
+
+class Inputs(NamedTuple):
+    """What a filter takes."""
+
+    mean: Tensor
+    cov: Tensor | None
+    previous_action: Tensor
+    observation: Tensor
+    observed: Tensor
+    reset: Tensor
+
+
+def sequences(state, batch=(3,), time=6, obs=5, action=2, seed=0):
+    """Sequences with a reset inside one row, a frame of nothing and a frame of everything."""
+    g, shape = torch.Generator().manual_seed(seed), (*batch, time)
+    randn = partial(torch.randn, generator=g, dtype=torch.float64)
+    observed = torch.rand(*shape, obs, generator=g) < 0.6
+    observed[..., 1, :], observed[..., 2, :] = False, True
+    observation = torch.where(observed, randn(*shape, obs), 0.0)
+    reset = torch.zeros(*shape, dtype=torch.bool)
+    reset[..., 0, 0] = reset[..., 1, 3] = True
+    return Inputs(randn(*batch, state), None, randn(*shape, action), observation, observed, reset)
 
 
 def outputs(*step):
@@ -60,29 +82,31 @@ def make_model(kind, dtype=torch.float64, obs=5, action=2, **options):
     return make_filter(obs, action, dtype, state, cov_network=kind == "network", **options)
 
 
-def by_hand(model, mean, cov, previous_action, observation, observed, reset, **options):
+def by_hand(
+    model, mean, cov, action, observation, observed, reset, noise=None, jacobian=None, **stored
+):
     """The oracle with a filter's own transition and emission."""
-    emission, propagated = model.emission, model.covariance == "propagated"
-    given = {
-        "transition": lambda m, a: model.transition(m, a)[0],
-        "transition_cov": lambda m, a: model.transition(m, a)[1],
-        "jacobian": model.mean_jacobian if propagated else None,
-        "noise": emission.cov(),
-    }
-    return oracles.filter_sequence(
-        observation=observation,
-        observed=observed,
-        previous_action=previous_action,
-        reset=reset,
-        start_mean=mean,
-        start_cov=cov,
-        initial_mean=model.initial_mean,
-        initial_cov=model.initial_cov,
-        matrix=emission.matrix,
-        action_matrix=emission.action_matrix,
-        bias=emission.offset,
-        **(given | options),
-    )
+    emission = model.emission
+    own = SimpleNamespace(
+        transition=lambda m, a: model.transition(m, a)[0],
+        transition_cov=lambda m, a: model.transition(m, a)[1],
+        jacobian=jacobian,
+        noise=emission.cov() if noise is None else noise,
+        matrix=emission.matrix, action_matrix=emission.action_matrix, bias=emission.offset,
+        initial_mean=model.initial_mean, initial_cov=model.initial_cov,
+    )  # fmt: skip
+    if model.covariance == "propagated" and jacobian is None:
+        own.jacobian = model.mean_jacobian
+    data = oracles.Data(observation, observed, action, reset, mean)
+    return oracles.filter_sequence(own, data, start_cov=cov, **stored)
+
+
+def space(system):
+    """A linear system of the oracles as the library takes it."""
+    return StateSpace(
+        system.transition, system.transition_cov, system.matrix, system.noise, system.action_matrix,
+        system.bias, system.initial_mean, system.initial_cov,
+    )  # fmt: skip
 
 
 class Problem:
@@ -93,6 +117,7 @@ class Problem:
     """
 
     weight: Tensor | None = None
+    plain = ("matrix", "action_matrix", "bias", "initial_mean")
 
     def __init__(
         self,
@@ -131,10 +156,7 @@ class Problem:
             "start_mean": data.start_mean,
             "transition_root": torch.linalg.cholesky(system.transition_cov),
             "noise": torch.linalg.cholesky(system.noise) if full_noise else system.noise.diagonal(),
-            "matrix": system.matrix,
-            "action_matrix": system.action_matrix,
-            "bias": system.bias,
-            "initial_mean": system.initial_mean,
+            **{name: getattr(system, name) for name in self.plain},
             "initial_root": torch.linalg.cholesky(system.initial_cov),
         }
         if stored:
@@ -170,18 +192,12 @@ class Problem:
         return q @ q.mT, p @ p.mT, r @ r.mT if self.full_noise else r
 
     def model(self, step_by_step=False):
-        q, p, r = self.covs()
-        return StateSpace(
-            transition=TransitionMLP(*self.network(), self.residual, self.activation),
-            transition_cov=(lambda m, _: q.expand(*m.shape, -1)) if step_by_step else q,
-            emission_matrix=self.leaves["matrix"],
-            emission_cov=r,
-            action_matrix=self.leaves["action_matrix"],
-            emission_offset=self.leaves["bias"],
-            initial_mean=self.leaves["initial_mean"],
-            initial_cov=p,
-            transition_jacobian=self.jacobian,
-        )
+        (q, p, r), leaf = self.covs(), self.leaves
+        f = TransitionMLP(*self.network(), self.residual, self.activation)
+        emission = leaf["matrix"], r, leaf["action_matrix"], leaf["bias"]
+        by_step = lambda m, _: q.expand(*m.shape, -1)  # noqa: E731
+        initial = leaf["initial_mean"], p
+        return StateSpace(f, by_step if step_by_step else q, *emission, *initial, self.jacobian)
 
     def arguments(self):
         named = (self.leaves[k] for k in ("start_mean", "previous_action", "observation"))
@@ -192,7 +208,6 @@ class Problem:
         return {"use_stored_state": self.use_stored, **names}
 
     def operator_arguments(self):
-        """Return what the native operator takes."""
         mean, action, x, seen, reset = self.arguments()
         use, stored, stored_cov = self.stored().values()
         belief = (use, stored, mean, stored_cov, self.start_cov)
@@ -203,12 +218,8 @@ class Problem:
         by_step = form == "step by step"
         if self.jacobian is not None:
             kwargs = {"cov": self.start_cov, **kwargs}
-        return function(
-            self.model(by_step),
-            *(arguments or self.arguments()),
-            form="auto" if by_step else form,
-            **kwargs,
-        )
+        kwargs["form"] = "auto" if by_step else form
+        return function(self.model(by_step), *(arguments or self.arguments()), **kwargs)
 
     def library(self, form):
         return self.run(form, **self.stored(), weight=self.weight, return_cov=True)
@@ -220,24 +231,14 @@ class Problem:
             added = noise.diagonal() * (1 / self.weight.clamp_min(1e-300) - 1)
             noise, observed = noise + torch.diag_embed(added), observed & (self.weight > 0)
         weights, biases = self.network()
-        out = oracles.filter_sequence(
-            observation=self.leaves["observation"],
-            observed=observed,
-            previous_action=self.leaves["previous_action"],
-            reset=self.reset,
-            start_mean=self.leaves["start_mean"],
-            start_cov=self.start_cov,
-            jacobian=self.jacobian,
-            initial_mean=self.leaves["initial_mean"],
-            initial_cov=p,
+        model = SimpleNamespace(
             transition=oracles.mean_network(weights, biases, self.residual, self.activation),
-            transition_cov=q,
-            matrix=self.leaves["matrix"],
-            noise=noise,
-            action_matrix=self.leaves["action_matrix"],
-            bias=self.leaves["bias"],
-            **self.stored(),
-        )
+            transition_cov=q, noise=noise, initial_cov=p, jacobian=self.jacobian,
+            **{name: self.leaves[name] for name in self.plain},
+        )  # fmt: skip
+        start, action, x, _, reset = self.arguments()
+        data = oracles.Data(x, observed, action, reset, start)
+        out = oracles.filter_sequence(model, data, start_cov=self.start_cov, **self.stored())
         return out.mean, out.cov, out.log_likelihood
 
     def gradients(self, outputs):
@@ -248,25 +249,15 @@ class Problem:
             weight = torch.randn(out.shape, generator=g, dtype=torch.float64).to(out.dtype)
             loss = loss + (weight * out).sum() + 0.1 * (weight * out.square()).sum()
         found = torch.autograd.grad(
-            loss, list(self.leaves.values()), allow_unused=True, retain_graph=True
+            loss, list(self.leaves.values()), materialize_grads=True, retain_graph=True
         )
-        return {
-            k: torch.zeros_like(v) if grad is None else grad
-            for (k, v), grad in zip(self.leaves.items(), found, strict=True)
-        }
+        return dict(zip(self.leaves, found, strict=True))
 
 
 def assert_same(problem, actual, expected, tolerance=TOLERANCE):
     for name, a, e in zip(("mean", "cov", "log_likelihood"), actual, expected, strict=True):
-        torch.testing.assert_close(
-            a, e, atol=tolerance, rtol=tolerance, msg=lambda m, n=name: f"{n}: {m}"
-        )
+        assert_equal(a, e, tolerance, name)
     found, truth = problem.gradients(actual), problem.gradients(expected)
-    for name in truth:
-        torch.testing.assert_close(
-            found[name],
-            truth[name],
-            atol=tolerance * max(1.0, float(truth[name].abs().max())),
-            rtol=tolerance,
-            msg=lambda m, n=name: f"gradient by {n}: {m}",
-        )
+    for name, e in truth.items():
+        scale = max(1.0, float(e.abs().max()))
+        assert_equal(found[name], e, tolerance, f"gradient by {name}", scale)

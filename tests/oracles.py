@@ -11,6 +11,7 @@ x = H s + B a + d + noise, Q the transition covariance, rows the indices of the 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -65,29 +66,11 @@ class Sequence:
 
 
 def filter_sequence(
-    *,
-    observation,
-    observed,
-    previous_action,
-    reset,
-    start_mean,
-    start_cov=None,
-    initial_mean,
-    initial_cov,
-    transition,
-    transition_cov,
-    matrix,
-    noise,
-    action_matrix=None,
-    bias=None,
-    jacobian=None,
-    use_stored_state=None,
-    stored_mean=None,
-    stored_cov=None,
+    model, data, *, start_cov=None, use_stored_state=None, stored_mean=None, stored_cov=None
 ):
-    """Filter [batch, time] data one row and one step at a time.
+    """Filter [batch, time] data one row and one step at a time; `model` has the fields of a system.
 
-    `start_mean` (b, s) is the filtered belief of the step before the first one. At a step with
+    `data.start_mean` (b, s) is the filtered belief of the step before the first one. At a step with
     `reset` (b, t) the predicted belief is the initial one. At a step with
     `use_stored_state` (b, t) the belief before the step is not the one just computed but
     `stored_mean` (b, t, s).
@@ -97,44 +80,34 @@ def filter_sequence(
     `noise` is R (n, n), or of every step one of its own (b, t, n, n), or a function of the
     predicted mean and covariance, the observation, its mask and the offset.
     """
-    batch, time = observed.shape[:2]
-    means, covs, lls = [], [], []
+    batch, time = data.observed.shape[:2]
+    m, out = model, []
     for b in range(batch):
-        mean = start_mean[b]
-        cov = initial_cov if start_cov is None else start_cov[b]
+        mean = data.start_mean[b]
+        cov = m.initial_cov if start_cov is None else start_cov[b]
         for t in range(time):
-            action = previous_action[b, t]
+            action = data.previous_action[b, t]
             if use_stored_state is not None and stored_mean is not None and use_stored_state[b, t]:
                 mean = stored_mean[b, t]
                 cov = cov if stored_cov is None else stored_cov[b, t]
-            if reset[b, t]:
-                mean, cov = initial_mean, initial_cov
+            if data.reset[b, t]:
+                mean, cov = m.initial_mean, m.initial_cov
             else:
-                q = transition_cov(mean, action) if callable(transition_cov) else transition_cov
-                f = jacobian(mean, action).detach() if callable(jacobian) else jacobian
-                mean, cov = predict(mean, cov.detach(), transition, q, action, f)
-            offset = None
-            if action_matrix is not None or bias is not None:
-                offset = torch.zeros_like(observation[b, t])
-                if action_matrix is not None:
-                    offset = offset + action_matrix @ action
-                if bias is not None:
-                    offset = offset + bias
-            x, seen = observation[b, t], observed[b, t]
-            if callable(noise):
-                own = noise(mean, cov, x, seen, offset)
+                q = m.transition_cov
+                q = q(mean, action) if callable(q) else q
+                f = m.jacobian(mean, action).detach() if callable(m.jacobian) else m.jacobian
+                mean, cov = predict(mean, cov.detach(), m.transition, q, action, f)
+            offset = m.action_matrix @ action + m.bias
+            x, seen = data.observation[b, t], data.observed[b, t]
+            if callable(m.noise):
+                own = m.noise(mean, cov, x, seen, offset)
             else:
-                own = noise[b, t] if noise.ndim == 4 else noise
-            step = (x, seen, matrix, own, offset)
-            lls.append(log_likelihood(mean, cov, *step))
+                own = m.noise[b, t] if m.noise.ndim == 4 else m.noise
+            step = (x, seen, m.matrix, own, offset)
+            ll = log_likelihood(mean, cov, *step)
             mean, cov = update(mean, cov, *step)
-            means.append(mean)
-            covs.append(cov)
-    return Sequence(
-        torch.stack(means).unflatten(0, (batch, time)),
-        torch.stack(covs).unflatten(0, (batch, time)),
-        torch.stack(lls).unflatten(0, (batch, time)),
-    )
+            out.append((mean, cov, ll))
+    return Sequence(*(torch.stack(x).unflatten(0, (batch, time)) for x in zip(*out, strict=True)))
 
 
 def mean_network(weights, biases, residual, activation):
@@ -197,10 +170,7 @@ def spd(dim, generator, scale=1.0):
 def random_system(state, obs, action=2, *, seed=0, full_noise=False):
     """A random stable system with an initial covariance that has nothing to do with Q."""
     g = torch.Generator().manual_seed(seed)
-
-    def randn(*shape):
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
-
+    randn = partial(torch.randn, generator=g, dtype=torch.float64)
     diagonal = (0.2 + 0.5 * torch.rand(obs, generator=g, dtype=torch.float64)) ** 2
     return LinearSystem(
         dynamics=0.9 * torch.linalg.qr(randn(state, state))[0],
@@ -232,10 +202,7 @@ def simulate(system, batch, time, *, seed=0, missing_rate=0.4, reset_rate=0.0):
     Where it fits, one frame holds nothing, one holds a single entry and one holds everything.
     """
     g = torch.Generator().manual_seed(1000 + seed)
-
-    def randn(*shape):
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
-
+    randn = partial(torch.randn, generator=g, dtype=torch.float64)
     n, s = system.obs_dim, system.state_dim
     root_q = torch.linalg.cholesky(system.transition_cov)
     root_r = torch.linalg.cholesky(system.noise)

@@ -5,6 +5,7 @@ import copy
 import csv
 import functools
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -26,6 +27,38 @@ TIMES = ("steps_per_second", "wall_time")
 TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 # A run of seconds with a fifth of its entries missing.
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.2")
+
+LAST = "checkpoints/frames_000000000512.pt"
+TABLE = r"metrics.csv` can't be read.*damaged"
+CHECKPOINT = r"512.pt` can't be read.* go on from `frames_.*256.pt`"
+# A file of the smoke run, what is in it instead (so many of its bytes; None: it is a folder), and
+# the line that refuses to go on with it.
+DAMAGED = [
+    ("metrics.csv", b"\xff\xfe\x00", TABLE),
+    ("metrics.csv", bytes(range(256)), TABLE),
+    ("metrics.csv", 0, TABLE),
+    ("metrics.csv", 4, "metrics.csv` can't be read as a table: is it damaged"),
+    ("metrics.csv", b"fram\n1\n", "metrics.csv` lacks the columns frames"),
+    ("metrics.csv", None, "metrics.csv` can't be read as a table: is it damaged"),
+    ("config.yaml", b"\xff\xfe\x00", "config.yaml"),
+    ("config.yaml", bytes(range(256)), "config.yaml"),
+    ("config.yaml", 0, "config.yaml"),
+    ("config.yaml", None, "config.yaml"),
+    ("checkpoints", b"no folder", "copy` holds no checkpoint"),
+    (LAST, 0, CHECKPOINT),
+    (LAST, 5000, CHECKPOINT),
+    (LAST, b"PK\x03\x04 cut", CHECKPOINT),
+    (LAST, None, "512.pt` must be a checkpoint"),
+]
+
+
+def damage(folder, name, content):
+    """Put something else where a file or a folder of a run is; see `DAMAGED`."""
+    path = folder / name
+    if isinstance(content, int):
+        content = path.read_bytes()[:content]
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    path.mkdir() if content is None else path.write_bytes(content)
 
 
 @functools.cache
@@ -106,12 +139,15 @@ def read_table(path):
     return [{k: v for k, v in row.items() if k not in TIMES} for row in rows]
 
 
-def assert_same_run(first, second):
-    """Two runs left the same tables and the same last checkpoint, to the last bit."""
-    for table in TABLES:
-        assert read_table(first / table) == read_table(second / table), table
+def unequal(first, second):
+    """Name what differs in the tables and the last checkpoints of two runs, to the last bit."""
+    found = [t for t in TABLES if read_table(first / t) != read_table(second / t)]
     states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
-    assert differences(*states) == []
+    return found + differences(*states)
+
+
+def assert_same_run(first, second):
+    assert unequal(first, second) == []
 
 
 def differences(first, second, path=""):

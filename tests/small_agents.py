@@ -47,8 +47,8 @@ class Agent:
         return TensorDictSequential(self.belief, self.critic)
 
 
-def make_filter(obs, action, dtype=None, state=None, cov_network=False, perturb=True, **kwargs):
-    """A filter of fixed parameters, all away from their starting values if `perturb`."""
+def make_filter(obs, action, dtype=None, state=None, cov_network=False, **kwargs):
+    """A filter of fixed parameters, all away from their starting values."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         if cov_network:
@@ -58,38 +58,23 @@ def make_filter(obs, action, dtype=None, state=None, cov_network=False, perturb=
         belief = BeliefFilter(obs, action, state, dtype=dtype, **kwargs)
         with torch.no_grad():
             for parameter in belief.parameters():
-                if perturb:
-                    parameter += 0.1 * torch.randn_like(parameter)
+                parameter += 0.1 * torch.randn_like(parameter)
     if belief.covariance == "propagated":
         belief.refresh_jacobian(belief.initial_mean, belief.initial_mean.new_zeros(action))
     return belief
 
 
 def make_agent(
-    belief,
-    feature_dim,
-    *,
-    features="features",
-    dtype=torch.float64,
-    init_std=2.0,
-    actions=ACTION,
-    norm=None,
+    belief, feature_dim, *, features="features", dtype=torch.float64, actions=ACTION, norm=None
 ):
     """Heads of fixed weights; a wide policy makes the poles fall soon."""
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        head = nn.Sequential(
-            nn.Linear(feature_dim, 8, dtype=dtype),
-            nn.Tanh(),
-            nn.Linear(8, 2 * actions, dtype=dtype),
-            NormalParamExtractor(scale_mapping=f"biased_softplus_{init_std}"),
-        )
-        actor = ProbabilisticActor(
-            TensorDictModule(head, [features], ["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=IndependentNormal,
-            return_log_prob=True,
-        )
+        first = nn.Linear(feature_dim, 8, dtype=dtype), nn.Tanh()
+        last = nn.Linear(8, 2 * actions, dtype=dtype), NormalParamExtractor("biased_softplus_2.0")
+        head = TensorDictModule(nn.Sequential(*first, *last), [features], ["loc", "scale"])
+        options = {"distribution_class": IndependentNormal, "return_log_prob": True}
+        actor = ProbabilisticActor(head, in_keys=["loc", "scale"], **options)
         critic = ValueOperator(nn.Linear(feature_dim, 1, dtype=dtype), in_keys=[features])
     return Agent(belief, actor, critic, norm)
 
@@ -106,13 +91,9 @@ def collect(agent, batches=2, dtype=torch.float64, env=None):
     """The last of some batches of (ENVS, TIME) steps: rows that start in mid-episode."""
     with torch.random.fork_rng():
         torch.manual_seed(2)
-        collector = Collector(
-            make_env(dtype) if env is None else env,
-            agent.policy,
-            frames_per_batch=ENVS * TIME,
-            total_frames=batches * ENVS * TIME,
-            auto_register_policy_transforms=True,
-        )
+        env = make_env(dtype) if env is None else env
+        sizes = {"frames_per_batch": ENVS * TIME, "total_frames": batches * ENVS * TIME}
+        collector = Collector(env, agent.policy, **sizes, auto_register_policy_transforms=True)
         try:
             data = [batch.clone() for batch in collector][-1]
         finally:
@@ -127,7 +108,6 @@ def make_gae(agent, **kwargs):
 
 
 def add_advantages(agent, data):
-    """Write advantages into a rollout."""
     with set_recurrent_mode(True), torch.no_grad():
         make_gae(agent)(data)
     return data

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from contracts import LossContract
+from refusals import refuses
 from tensordict import TensorDict
 
 from torchrl_drbpn import BeliefModelLoss
@@ -119,17 +120,18 @@ def test_an_end_that_a_sampler_of_single_steps_wrote_is_not_believed():
     assert torch.equal(loss.last_steps(by_steps), data["next", "terminated"].squeeze(-1) | final)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "change", "error", "message"),
-    [
-        ({"normalize": "batch"}, None, ValueError, "`normalize` must be 'entry' or 'step', got 'b"),
-        ({"reduction": "max"}, None, ValueError, "`reduction` must be 'none', 'mean' or 'sum'"),
-        ({}, lambda d: d.exclude("observed"), KeyError, "not in .*: run the belief module on it"),
-        ({}, lambda d: d.exclude("belief"), KeyError, "not in .*: run the belief module on it"),
-        ({}, lambda d: d.set("observed", d["observed"].float()), ValueError, MASK),
-        ({}, lambda d: d.set("observed", d["observed"][..., 0]), ValueError, MASK),
-    ],
-)  # fmt: skip
-def test_bad_use_is_one_clear_line(kwargs, change, error, message):
-    with pytest.raises(error, match=message):
-        BeliefModelLoss(**kwargs)(change(make_data()))
+def of(change):
+    """Return the use of the loss on data that are changed."""
+    return lambda: BeliefModelLoss()(change(make_data()))
+
+
+UNRUN = "not in .*: run the belief module on it"
+test_bad_use_is_one_clear_line = refuses(
+    ({"normalize": "batch"}, "`normalize` must be 'entry' or 'step', got 'b"),
+    ({"reduction": "max"}, "`reduction` must be 'none', 'mean' or 'sum'"),
+    (of(lambda d: d.exclude("observed")), KeyError, UNRUN),
+    (of(lambda d: d.exclude("belief")), KeyError, UNRUN),
+    (of(lambda d: d.set("observed", d["observed"].float())), MASK),
+    (of(lambda d: d.set("observed", d["observed"][..., 0])), MASK),
+    make=BeliefModelLoss,
+)

@@ -6,6 +6,7 @@ import oracles
 import pytest
 import torch
 from contracts import LossContract
+from refusals import refuses
 from small_agents import ACTION, OBS, TIME, add_advantages, collect, make_agent, make_filter
 from tensordict.nn import TensorDictSequential
 from torch import nn
@@ -371,22 +372,16 @@ def test_a_norm_in_front_of_the_filter_scales_the_next_observation_too():
         torch.testing.assert_close(outs[0][key], value, msg=key)
 
 
-@pytest.mark.parametrize(
-    ("use", "error", "message"),
-    [
-        (lambda: make_loss()(make_data().exclude("advantage")), KeyError,
-         "`advantage` is not in the tensordict: compute advantages"),
-        (lambda: make_loss(model_coeff=-1.0), ValueError,
-         "`model_coeff` must be at least 0, got -1"),
-        (lambda: make_loss().set_keys(advantages="a"), ValueError,
-         r"'advantages'.*DRBPNLoss; it accepts .*'advantage'"),
-        (lambda: make_gru_loss(BeliefModelLoss()), ValueError,
-         r"`model_loss` reads .*not among the out_keys"),
-    ],
+test_bad_use_is_one_clear_line = refuses(
+    (lambda: make_loss()(make_data().exclude("advantage")), KeyError,
+     "`advantage` is not in the tensordict: compute advantages"),
+    (lambda: make_loss(model_coeff=-1.0), ValueError,
+     "`model_coeff` must be at least 0, got -1"),
+    (lambda: make_loss().set_keys(advantages="a"), ValueError,
+     r"'advantages'.*DRBPNLoss; it accepts .*'advantage'"),
+    (lambda: make_gru_loss(BeliefModelLoss()), ValueError,
+     r"`model_loss` reads .*not among the out_keys"),
 )  # fmt: skip
-def test_bad_use_is_one_clear_line(use, error, message):
-    with pytest.raises(error, match=message):
-        use()
 
 
 @pytest.mark.parametrize("model_coeff", [0.0, 1.0])

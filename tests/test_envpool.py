@@ -13,16 +13,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from env_tools import TASKS, play, random_actions
+from env_tools import MARKS, TASKS, play, random_actions
+from refusals import refuses
 from torchrl.envs import check_env_specs
 
 from torchrl_drbpn.envs import EnvPoolBatchEnv, GymnasiumBatchEnv
 
-# Version 4 is tested on purpose.
-pytestmark = [
-    pytest.mark.usefixtures("own_directory"),
-    pytest.mark.filterwarnings("ignore:.*is out of date"),
-]
+pytestmark = MARKS
 
 FREE_JOINT = [task for task in TASKS if task.startswith(("Ant", "Humanoid"))]
 OTHERS = [task for task in TASKS if task not in FREE_JOINT]
@@ -132,19 +129,13 @@ def test_a_truncated_row_may_be_stepped_on():
     assert done == [False, True, True, True]
 
 
-@pytest.mark.parametrize(
-    ("use", "error", "match"),
-    [
-        (lambda: EnvPoolBatchEnv("CartPole-v1", 1), ValueError, "action space .* got Discrete"),
-        (lambda: EnvPoolBatchEnv("CheetahRun-v1", 1), ValueError, "got Dict.*`observation_keys`"),
-        (lambda: EnvPoolBatchEnv("Swimmer-v5", 1, render_mode="rgb_array"), TypeError,
-         r"takes no \['render_mode'\]"),
-        (lambda: EnvPoolBatchEnv("Swimmer-v5", 1).reset(options={"x": 1}), ValueError, "no `opti"),
-    ],
+test_what_envpool_does_not_have_is_refused = refuses(
+    (lambda: EnvPoolBatchEnv("CartPole-v1", 1), ValueError, "action space .* got Discrete"),
+    (lambda: EnvPoolBatchEnv("CheetahRun-v1", 1), ValueError, "got Dict.*`observation_keys`"),
+    (lambda: EnvPoolBatchEnv("Swimmer-v5", 1, render_mode="rgb_array"), TypeError,
+     r"takes no \['render_mode'\]"),
+    (lambda: EnvPoolBatchEnv("Swimmer-v5", 1).reset(options={"x": 1}), ValueError, "no `opti"),
 )  # fmt: skip
-def test_what_envpool_does_not_have_is_refused(use, error, match):
-    with pytest.raises(error, match=match):
-        use()
 
 
 def test_a_task_of_dm_control_is_a_vector_of_the_entries_asked_for():

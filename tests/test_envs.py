@@ -3,16 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from env_tools import BACKENDS, TASKS, play, random_actions
+from env_tools import BACKENDS, MARKS, TASKS, play, random_actions
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv, check_env_specs
 from torchrl.testing import rollout_consistency_assertion
 
-# Version 4 is tested on purpose.
-pytestmark = [
-    pytest.mark.usefixtures("own_directory"),
-    pytest.mark.filterwarnings("ignore:.*is out of date"),
-    pytest.mark.parametrize("backend", BACKENDS),
-]
+pytestmark = [*MARKS, pytest.mark.parametrize("backend", BACKENDS)]
 
 
 @pytest.mark.parametrize("env_id", TASKS)

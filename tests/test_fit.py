@@ -14,9 +14,9 @@ from estimation import fitting
 from estimation.fitting import Sequences, fit, hide, per_entry, run, split
 from estimation.logs import read_log
 from evaluation_tools import configured
+from filter_problems import space
 from recipe_tools import assembled, refused
 from safetensors.torch import load_file
-from test_functional_smoothing import space
 
 from torchrl_drbpn import BeliefFilter, GaussianTransition
 from torchrl_drbpn.functional import filter_sequence

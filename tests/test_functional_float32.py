@@ -1,5 +1,7 @@
 """What float32 may cost: with R at its floor the chosen form keeps the digits of float64."""
 
+from functools import partial
+
 import pytest
 import torch
 from filter_problems import FORMS, SIZES, Problem
@@ -19,10 +21,7 @@ def at_the_noise_floor(state, obs, *, full_noise=False, rank=None, spread=0.3):
     options = {"batch": batch, "time": time, "hidden": (32,), "residual": False}
     double = Problem(state, obs, full_noise=full_noise, **options)
     leaves, g = double.leaves, torch.Generator().manual_seed(0)
-
-    def randn(*shape):
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
-
+    randn = partial(torch.randn, generator=g, dtype=torch.float64)
     density = torch.linspace(0, 1, time).view(1, time, 1)
     double.observed = torch.rand(batch, time, obs, generator=g) < density
     with torch.no_grad():

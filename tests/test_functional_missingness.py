@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from refusals import refuses
 
 from torchrl_drbpn.functional.missingness import (
     draw_mechanism,
@@ -182,24 +183,18 @@ def test_spikes_hit_with_their_probability_and_have_their_deviation():
 LEAVES = "`always_observed` must leave an entry that can go miss"
 
 
-@pytest.mark.parametrize(
-    ("use", "what"),
-    [
-        (lambda: mechanism("mar", always_observed=-0.1), r"`always_observed` must be a share in"),
-        (lambda: mechanism("mar", always_observed=1.1), r"`always_observed` must be a share in"),
-        (lambda: mechanism("mar", always_observed=math.nan), r"`always_observed` must be a share"),
-        (lambda: mechanism("mar", always_observed=1.0), LEAVES),
-        (lambda: mechanism("mar", always_observed=0.95), LEAVES),
-        (lambda: draw_mechanism("mar", 1, 2, always_observed=0.0, generator=seeded()), LEAVES),
-        (lambda: mechanism("mcar"), '`kind` must be "mar" or "nmar"'),
-        (lambda: outage_rates(1.0, 5), r"`eta` must be a share of time in \[0, 1\), got 1.0"),
-        (lambda: outage_rates(-0.1, 5), "`eta` must be a share"),
-        (lambda: outage_rates(math.nan, 5), "`eta` must be a share"),
-        (lambda: outage_rates(0.5, 0.9), "`mean_length` must be the mean length of an outage in"),
-        (lambda: outage_rates(0.5, math.inf), "`mean_length` must be the mean length"),
-        (lambda: outage_rates(0.8, 3.9), r"at least eta / \(1 - eta\) = 4 steps for eta 0.8"),
-    ],
+test_numbers_that_no_law_has_are_refused = refuses(
+    (lambda: mechanism("mar", always_observed=-0.1), r"`always_observed` must be a share in"),
+    (lambda: mechanism("mar", always_observed=1.1), r"`always_observed` must be a share in"),
+    (lambda: mechanism("mar", always_observed=math.nan), r"`always_observed` must be a share"),
+    (lambda: mechanism("mar", always_observed=1.0), LEAVES),
+    (lambda: mechanism("mar", always_observed=0.95), LEAVES),
+    (lambda: draw_mechanism("mar", 1, 2, always_observed=0.0, generator=seeded()), LEAVES),
+    (lambda: mechanism("mcar"), '`kind` must be "mar" or "nmar"'),
+    (lambda: outage_rates(1.0, 5), r"`eta` must be a share of time in \[0, 1\), got 1.0"),
+    (lambda: outage_rates(-0.1, 5), "`eta` must be a share"),
+    (lambda: outage_rates(math.nan, 5), "`eta` must be a share"),
+    (lambda: outage_rates(0.5, 0.9), "`mean_length` must be the mean length of an outage in"),
+    (lambda: outage_rates(0.5, math.inf), "`mean_length` must be the mean length"),
+    (lambda: outage_rates(0.8, 3.9), r"at least eta / \(1 - eta\) = 4 steps for eta 0.8"),
 )
-def test_numbers_that_no_law_has_are_refused(use, what):
-    with pytest.raises(ValueError, match=what):
-        use()

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from filter_problems import Problem, assert_equal, assert_same
+from filter_problems import Problem, assert_equal, assert_same, built
 from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from torchrl_drbpn.functional import StateSpace, filter_sequence, filtering, native, native_status
+from torchrl_drbpn.functional import StateSpace, filter_sequence, filtering, native
 
-built = pytest.mark.skipif(native_status() is not None, reason="not built")
 operator = torch.ops.torchrl_drbpn.filter_rows
 
 
@@ -39,9 +38,7 @@ def test_every_size_equals_the_pytorch_form(batch, time, state, obs, propagated)
 
 @built
 @pytest.mark.parametrize(
-    ("obs", "propagated"),
-    [(3, False), (5, False), (5, True)],
-    ids=["obs", "state", "F"],
+    ("obs", "propagated"), [(3, False), (5, False), (5, True)], ids=["obs", "state", "F"]
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_it_passes_the_checks_of_torch_library(obs, dtype, propagated):

@@ -1,5 +1,6 @@
 """Laws of `functional` over masks, shapes, dtypes and dimensions drawn at random."""
 
+import functools
 import itertools
 import math
 
@@ -26,7 +27,7 @@ def draw(state, obs, seed, batch, share, full_noise, dtype):
     """A predicted belief, readings, mask, H, R and offsets, as `update` takes them."""
     g = torch.Generator().manual_seed(seed)
     system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise).to(dtype)
-    randn = lambda *s: torch.randn(*batch, *s, generator=g, dtype=torch.float64)  # noqa: E731
+    randn = functools.partial(torch.randn, *batch, generator=g, dtype=torch.float64)
     mean, root, x, offset = randn(state), randn(state, state), 2 * randn(obs), randn(obs)
     cov = root @ root.mT / state + 0.3 * torch.eye(state)
     observed = torch.rand(*batch, obs, generator=g) < share

@@ -5,23 +5,10 @@ import math
 import oracles
 import pytest
 import torch
-from filter_problems import Problem, assert_equal
+from filter_problems import Problem, assert_equal, sequences, space
 
 from torchrl_drbpn import BeliefFilter
-from torchrl_drbpn.functional import (
-    Belief,
-    StateSpace,
-    forecast,
-    row_jacobian,
-    smooth_sequence,
-)
-
-
-def space(system):
-    return StateSpace(
-        system.transition, system.transition_cov, system.matrix, system.noise, system.action_matrix,
-        system.bias, system.initial_mean, system.initial_cov,
-    )  # fmt: skip
+from torchrl_drbpn.functional import Belief, forecast, row_jacobian, smooth_sequence
 
 
 def linear(time=7, *, batch=3, reset_rate=0.3, seed=0):
@@ -70,7 +57,7 @@ def test_it_is_the_joint_gaussian_conditioned_on_all_readings_with_its_gradients
     for a, b in zip(found, truth, strict=True):
         assert_equal(a, b)
     for name, a, b in zip(leaves, *gradients, strict=True):
-        torch.testing.assert_close(a, b, atol=1e-8, rtol=1e-8, msg=lambda m, n=name: f"{n}: {m}")
+        assert_equal(a, b, 1e-8, name)
 
 
 def textbook(problem, row, jacobian):
@@ -120,9 +107,7 @@ def test_a_network_is_smoothed_as_the_textbook_extends_it(given):
     assert_equal(found.cov, cov)
     mine, theirs = (problem.gradients(out) for out in (tuple(found), (mean, cov)))
     for name, value in theirs.items():
-        torch.testing.assert_close(
-            mine[name], value, atol=1e-8, rtol=1e-8, msg=lambda m, n=name: f"{n}: {m}"
-        )
+        assert_equal(mine[name], value, 1e-8, name)
 
 
 def test_a_reading_of_huge_noise_is_a_missing_one_and_r_per_step_is_r():
@@ -188,12 +173,10 @@ def test_a_forecast_is_what_the_smoother_says_of_steps_without_readings():
 def test_a_filter_ends_in_its_smoothed_belief_and_forecasts_what_it_predicts(jacobian):
     options = {"covariance": "propagated", "jacobian": jacobian} if jacobian else {}
     module = BeliefFilter(5, 2, 3, dtype=torch.float64, **options)
-    x, observed = torch.randn(4, 6, 5).double(), torch.rand(4, 6, 5) < 0.7
-    reset = torch.zeros(4, 6, dtype=torch.bool)
-    reset[:, -1] = jacobian is None  # where it starts afresh, a constant covariance is exact
     cov = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)  # read where it is propagated
-    action = torch.randn(4, 6, 2).double()
-    sequence = (torch.randn(4, 3).double(), cov, action, x, observed, reset)
+    mean, _, action, x, observed, reset = sequences(3, (4,))
+    sequence = mean, cov, action, x, observed, torch.zeros_like(reset)
+    sequence[-1][:, -1] = jacobian is None  # where it starts afresh, a constant covariance is exact
     filtered, smoothed = module(*sequence, return_cov=True), module.smooth(*sequence)
     assert_equal(smoothed.mean[:, -1], filtered.mean[:, -1])
     assert_equal(smoothed.cov[:, -1], filtered.cov[:, -1])

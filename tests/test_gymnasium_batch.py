@@ -10,17 +10,13 @@ import numpy as np
 import pytest
 import torch
 from contracts import parallel_env, saved
-from env_tools import TASKS, play, random_actions
+from env_tools import MARKS, TASKS, play, random_actions
 from gymnasium import spaces
 from torchrl.envs import check_env_specs
 
 from torchrl_drbpn import GymnasiumBatchEnv, SimulatorError
 
-# Version 4 is tested on purpose.
-pytestmark = [
-    pytest.mark.usefixtures("own_directory"),
-    pytest.mark.filterwarnings("ignore:.*is out of date"),
-]
+pytestmark = MARKS
 
 VECTOR = spaces.Box(-1, 1, (3,), np.float32)
 IMAGE = spaces.Box(0, 255, (8, 8, 3), np.uint8)

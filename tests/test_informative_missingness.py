@@ -2,10 +2,11 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
-from filter_problems import assert_equal
+from filter_problems import assert_equal, sequences
 from tensordict import TensorDict
 from torchrl.modules import set_recurrent_mode
 
@@ -41,9 +42,7 @@ def test_one_missing_entry_has_the_moments_and_probability_of_numerical_integrat
     exact = (weight * s).sum() / Z
     spread = (weight * (s - exact) ** 2).sum() / Z
 
-    def vector(x):
-        return torch.tensor([x], **DOUBLE)
-
+    vector = lambda x: torch.tensor([x], **DOUBLE)  # noqa: E731
     after, log_mask = update_by_mask(
         Belief(vector(mean), vector(P)[None]), vector(math.nan), torch.tensor([False]),
         vector(h)[None], vector(R), vector(o), MaskModel(vector(a), vector(slope)),
@@ -66,10 +65,7 @@ def system(mask_model=None, *, propagated=True):
 def high_readings_are_missing(rows=150, time=40):
     """Return the states and what the filter is given: P(arrives) = 1 / (1 + exp(3 x))."""
     g = torch.Generator().manual_seed(0)
-
-    def noise(*shape):
-        return torch.randn(*shape, generator=g, **DOUBLE)
-
+    noise = partial(torch.randn, generator=g, **DOUBLE)
     states = [noise(rows)]
     for _ in range(time - 1):
         states.append(0.95 * states[-1] + 0.3 * noise(rows))
@@ -155,11 +151,9 @@ def test_the_module_learns_it_by_the_model_loss_and_steps_are_the_sequence(covar
     belief_filter = BeliefFilter(3, 2, mask_model=True, covariance=covariance, dtype=torch.float64)
     with torch.no_grad():
         belief_filter.mask_model.copy_(torch.randn(2, 3))
-    x, observed = torch.randn(4, 5, 3, **DOUBLE), torch.rand(4, 5, 3) < 0.5
-    reset = torch.zeros(4, 5, dtype=torch.bool)
+    mean, _, action, x, observed, reset = sequences(3, (4,), 5, obs=3)
+    mean, cov, action = 0 * mean, torch.zeros(4, 3, 3, **DOUBLE), 0 * action
     reset[:, 0] = True
-    action = torch.zeros(4, 5, 2, **DOUBLE)
-    mean, cov = torch.zeros(4, 3, **DOUBLE), torch.zeros(4, 3, 3, **DOUBLE)
     whole = belief_filter(mean, cov, action, x, observed, reset, return_cov=True)
     for t in range(5):
         steps = (action[:, t], x[:, t], observed[:, t], reset[:, t])

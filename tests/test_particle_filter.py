@@ -4,6 +4,7 @@ import pytest
 import torch
 from contracts import ACTION, OBS, BeliefModuleContract
 from particle_tools import HIDDEN, LATENT, OPTIONAL, K, make_filter, make_frames, sample_noise
+from refusals import refuses
 from torch.distributions import Normal
 from torchrl.modules import set_recurrent_mode
 
@@ -216,18 +217,13 @@ def test_optional_entries_are_written_where_asked_for(over_time):
     assert (share <= K + 1e-9).all()
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"num_particles": 0}, "`num_particles` must be an int of at least 1, got 0"),
-        ({"latent_dim": 2.0}, "`latent_dim` must be an int of at least 1, got 2.0"),
-        ({"encoder_sizes": (4,)}, "`encoder_sizes` must be two sizes"),
-        ({"min_std": -1.0}, "`min_std` must be at least 0, got -1.0"),
-    ],
+test_a_wrong_size_is_refused = refuses(
+    ({"num_particles": 0}, "`num_particles` must be an int of at least 1, got 0"),
+    ({"latent_dim": 2.0}, "`latent_dim` must be an int of at least 1, got 2.0"),
+    ({"encoder_sizes": (4,)}, "`encoder_sizes` must be two sizes"),
+    ({"min_std": -1.0}, "`min_std` must be at least 0, got -1.0"),
+    make=make_filter,
 )
-def test_a_wrong_size_is_refused(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        make_filter(**kwargs)
 
 
 def test_systematic_resampling_gives_each_particle_its_share_rounded_and_on_average_exactly():

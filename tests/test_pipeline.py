@@ -5,17 +5,7 @@ import functools
 import pytest
 import torch
 from particle_tools import make_filter as make_particles
-from small_agents import (
-    ACTION,
-    GAMMA,
-    LMBDA,
-    OBS,
-    TIME,
-    collect,
-    make_agent,
-    make_filter,
-    make_gae,
-)
+from small_agents import ACTION, GAMMA, LMBDA, OBS, TIME, collect, make_agent, make_filter, make_gae
 from tensordict import TensorDict, pad
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from filter_problems import make_model
+from filter_problems import make_model, sequences
 from tensordict import TensorDict
 from torch import nn
 
@@ -27,30 +27,24 @@ def make(kind, policy_input="mean", dtype=torch.float64, **keys):
 
 
 def first_step(belief):
-    """The arguments of a PolicyStep at the first step of an episode."""
-    observation, observed, is_init = (x[0] for x in inputs(OBS))
+    observation, observed, is_init = (x[0] for x in inputs())
     action = torch.zeros(BATCH, ACTION, dtype=torch.float64)
     state = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
     return [observation, observed, action, is_init, *state]
 
 
-def inputs(obs, dtype=torch.float64, seed=0):
+def inputs():
     """Per step: observation, mask, first step of an episode; one row restarts in the middle."""
-    g = torch.Generator().manual_seed(seed)
-    observation = torch.randn(TIME, BATCH, obs, generator=g, dtype=dtype)
-    observed = torch.rand(TIME, BATCH, obs, generator=g) > 0.4
-    observed[3] = False
-    is_init = torch.zeros(TIME, BATCH, 1, dtype=torch.bool)
-    is_init[0] = True
-    is_init[6, 1] = True
-    return observation, observed, is_init
+    *_, observation, observed, reset = sequences(OBS, (BATCH,), TIME)
+    reset[:, 0] = True
+    return *(x.transpose(0, 1) for x in (observation, observed)), reset.T.unsqueeze(-1)
 
 
 def run(step, belief):
     """Act through the steps; the state is put back to zero where an episode starts."""
     mean, age, *cov = PolicyStep(belief, nn.Identity()).initial_state(BATCH)
     action, out = torch.zeros(BATCH, ACTION, dtype=mean.dtype), []
-    for observation, observed, fresh in zip(*inputs(OBS), strict=True):
+    for observation, observed, fresh in zip(*inputs(), strict=True):
         mean, age = torch.where(fresh, 0.0, mean), torch.where(fresh, 0, age)
         action = torch.where(fresh, 0.0, action)
         _, mean, age, action, rejected, *cov = step(
@@ -168,7 +162,7 @@ def test_any_batch_shape_is_taken_and_the_module_may_be_cast(kind, batch):
 
 def test_a_normalised_policy_is_one_step_with_its_statistics():
     belief, head = make("innovation", in_key="normalized_observation")
-    norm, (observation, observed, _) = MaskedObservationNorm(OBS), inputs(OBS)
+    norm, (observation, observed, _) = MaskedObservationNorm(OBS), inputs()
     rollout = TensorDict(observation=3 * observation + 5, observed=observed)
     rollout.batch_size = [TIME, BATCH]
     norm.update(rollout)

@@ -1,29 +1,21 @@
 """The propagated covariance, P = F cov F' + Q: its digits, its Jacobian, its key."""
 
+from dataclasses import replace
+
 import oracles
 import pytest
 import torch
-from filter_problems import TOLERANCE, Problem, assert_equal, by_hand
+from filter_problems import TOLERANCE, Problem, assert_equal, by_hand, sequences, space
 from torch import nn
 
 from torchrl_drbpn import BeliefFilter, GaussianTransition
 from torchrl_drbpn.functional import (
     Belief,
-    StateSpace,
     TransitionMLP,
     filter_sequence,
     filter_step,
     filtered_cov,
 )
-
-
-def linear(system):
-    weight = torch.cat([system.dynamics, system.control], 1)
-    f = TransitionMLP((weight,), (torch.zeros_like(system.initial_mean),), False, "relu")
-    return StateSpace(
-        f, system.transition_cov, system.matrix, system.noise.diagonal(), system.action_matrix,
-        system.bias, system.initial_mean, system.initial_cov, system.dynamics,
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("form", ["auto", "pytorch"])
@@ -32,10 +24,14 @@ def linear(system):
 def test_float32_stays_positive_definite_over_ten_thousand_steps(obs, expands, form):
     g = torch.Generator().manual_seed(0)
     system = oracles.random_system(4, obs).to(torch.float32)
-    model = linear(system)
-    model.transition_jacobian = expands * system.dynamics / 0.9
-    model.transition_cov = torch.full((4,), 1e-6)  # the floor of a GaussianTransition
-    model.emission_cov = torch.full((obs,), 1e-4)
+    weight = torch.cat([system.dynamics, system.control], 1)
+    model = replace(
+        space(system),
+        transition=TransitionMLP((weight,), (torch.zeros(4),), False, "relu"),
+        transition_jacobian=expands * system.dynamics / 0.9,
+        transition_cov=torch.full((4,), 1e-6),  # the floor of a GaussianTransition
+        emission_cov=torch.full((obs,), 1e-4),
+    )
     seen = torch.rand(1, 10_000, obs, generator=g) < 0.5
     seen[:, 3000:6000] = False
     seen[:, :, 0] = False
@@ -97,38 +93,32 @@ def test_the_closed_form_jacobian_is_that_of_autograd(hidden, activation, residu
     assert_equal(f.jacobian(mean, action, average=True), rows.mean((0, 1)), 1e-12)
 
 
-def inputs(batch=4, time=6, obs=5):
-    torch.manual_seed(1)
-    seen = torch.rand(batch, time, obs) < 0.6
-    reset = torch.zeros(batch, time, dtype=torch.bool)
-    reset[:, 0] = reset[0, 3] = True
-    return torch.randn(batch, time, 2), torch.randn(batch, time, obs), seen, reset
-
-
 def test_a_fresh_filter_sets_its_jacobian_once_and_it_is_saved_with_it():
     torch.manual_seed(0)
-    filter = BeliefFilter(5, 2, 3, covariance="propagated")
-    start = torch.zeros(4, 3), torch.zeros(4, 3, 3)
-    first = filter(*start, *inputs())
+    filter, data = BeliefFilter(5, 2, 3, covariance="propagated").double(), sequences(3, (4,))
+    inputs = data._replace(mean=0 * data.mean, cov=torch.zeros(4, 3, 3).double())
+    first = filter(*inputs)
     jacobian = filter.mean_jacobian.clone()
     assert jacobian.isfinite().all()
     with torch.no_grad():
         filter.transition.layers[0].weight.mul_(3)
-    filter(*start, *inputs())
+    filter(*inputs)
     assert torch.equal(filter.mean_jacobian, jacobian)
 
-    other = BeliefFilter(5, 2, 3, covariance="propagated")
+    other = BeliefFilter(5, 2, 3, covariance="propagated").double()
     other.load_state_dict(filter.state_dict())
-    again = other(*start, *inputs())
+    again = other(*inputs)
     assert torch.equal(other.mean_jacobian, jacobian)
     assert not torch.equal(again.mean, first.mean)
-    mean, action = torch.randn(9, 3), torch.randn(9, 2)
+    mean, action = torch.randn(9, 3).double(), torch.randn(9, 2).double()
     other.refresh_jacobian(mean, action)
     expected = other.transition.mean_network().jacobian(mean, action).mean(0)
     torch.testing.assert_close(other.mean_jacobian, expected)
     other.reset_parameters()
-    other(*start, *inputs())
-    expected = other.transition.mean_network().jacobian(torch.zeros(3), torch.zeros(2))
+    other(*inputs)
+    expected = other.transition.mean_network().jacobian(
+        torch.zeros(3).double(), torch.zeros(2).double()
+    )
     torch.testing.assert_close(other.mean_jacobian, expected)
     with pytest.raises(ValueError, match="covariance='propagated'"):
         BeliefFilter(5, 2).refresh_jacobian(mean, action)
@@ -141,7 +131,7 @@ def test_a_filter_propagates_by_the_jacobian_of_its_transition(jacobian, own):
     options = {"covariance": "propagated", "jacobian": jacobian}
     filter = BeliefFilter(5, 2, 3, transition=Own(3) if own else None, **options).double()
     f = lambda m, a: filter.transition(m, a)[0]  # noqa: E731
-    data = [x.double() if x.is_floating_point() else x for x in inputs()]
+    data = sequences(3, (4,))[2:]
     mean, action = torch.randn(9, 3).double(), torch.randn(9, 2).double()
     filter.refresh_jacobian(mean, action)
     rows = torch.func.vmap(torch.func.jacrev(f))

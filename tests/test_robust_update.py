@@ -7,7 +7,7 @@ from typing import get_args
 import oracles
 import pytest
 import torch
-from filter_problems import by_hand, make_model
+from filter_problems import by_hand, make_model, sequences
 from torch import nn
 
 from torchrl_drbpn import (
@@ -34,24 +34,16 @@ def before(model):
 
 def inputs(model, wrong=0.25):
     """Sequences whose readings are off in a share; row 0 has none, row 1 one; two rows start."""
-    g = torch.Generator().manual_seed(0)
-
-    def draw(*shape):
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
-
-    mean, action = draw(BATCH, model.state_dim), draw(BATCH, TIME, ACTION)
-    observation = draw(BATCH, TIME, OBS)
+    mean, _, action, observation, observed, reset = sequences(model.state_dim, (BATCH,), TIME)
+    g = torch.Generator().manual_seed(1)
     spiked = torch.rand(BATCH, TIME, OBS, generator=g) < wrong
     observation = torch.where(spiked, 30.0 * observation, observation)
-    observed = torch.rand(BATCH, TIME, OBS, generator=g) < 0.8
     observed[0], observed[1] = False, torch.arange(OBS) == 2
-    reset = torch.zeros(BATCH, TIME, dtype=torch.bool)
-    reset[-2:, 0] = reset[2, 3] = True
+    reset[-2:, 0] = True
     return mean, action, observation, observed, reset
 
 
 def first(data):
-    """One step of the sequences."""
     return data[0], *(x[:, 0] for x in data[1:])
 
 

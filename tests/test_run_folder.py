@@ -15,10 +15,13 @@ import ppo_drbpn
 import pytest
 import torch
 from recipe_tools import (
+    CHECKPOINT,
+    DAMAGED,
     SMOKE,
     TABLES,
     assembled,
     assert_same_run,
+    damage,
     make_config,
     read_table,
     refused,
@@ -70,32 +73,9 @@ def test_a_file_where_a_folder_should_be_is_named(tmp_path):
         run(tmp_path / "run" / "below", *SMOKE)
 
 
-LAST = "checkpoints/frames_000000000512.pt"
-TABLE = r"metrics.csv` can't be read.*damaged"
-CHECKPOINT = r"512.pt` can't be read.* go on from `frames_.*256.pt`"
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "line"),
-    [
-        ("metrics.csv", b"\xff\xfe\x00", TABLE),
-        ("metrics.csv", b"", TABLE),
-        ("metrics.csv", b"fram\n1\n", "metrics.csv` lacks the columns frames"),
-        ("metrics.csv", None, "metrics.csv` can't be read as a table: is it damaged"),
-        ("config.yaml", b"\xff\xfe\x00", "config.yaml"),
-        ("config.yaml", b"", "config.yaml"),
-        ("config.yaml", None, "config.yaml"),
-        ("checkpoints", b"no folder", "copy` holds no checkpoint"),
-        (LAST, b"", CHECKPOINT),
-        (LAST, b"PK\x03\x04 cut", CHECKPOINT),
-        (LAST, None, "512.pt` must be a checkpoint"),
-    ],
-)
+@pytest.mark.parametrize(("name", "content", "line"), DAMAGED)
 def test_what_is_damaged_is_named_and_stays_as_it_is(folder, name, content, line):
-    """With content None a folder is where a file should be."""
-    path = folder / name
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
-    path.mkdir() if content is None else path.write_bytes(content)
+    damage(folder, name, content)
     before = contents(folder)
     with refused(line):
         resume(folder, "total_frames=640")

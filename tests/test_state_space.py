@@ -6,6 +6,7 @@ import itertools
 import oracles
 import pytest
 import torch
+from refusals import refuses
 
 from torchrl_drbpn import GaussianTransition, LinearGaussianEmission
 
@@ -164,20 +165,14 @@ Q = functools.partial(GaussianTransition, STATE, ACTION)
 R = functools.partial(LinearGaussianEmission, OBS, STATE, ACTION)
 
 
-@pytest.mark.parametrize(
-    ("use", "message"),
-    [
-        *[(functools.partial(make, **kwargs), message) for make in (Q, R) for kwargs, message in (
-            ({"cov": "scalar"}, "`cov` must be one of diag, full, got 'scalar'"),
-            ({"init_std": 0.01, "min_std": 0.02}, "`min_std` and `init_std` must satisfy"),
-            ({"min_std": 0.0}, "0 < min_std < init_std, got min_std=0"),
-            ({"init_std": float("nan")}, "`min_std` and `init_std` must satisfy"),
-        )],
-        (lambda: Q(activation="gelu"), "`activation` must be one of relu, tanh, got 'gelu'"),
-        (lambda: Q(cov_network=True).cov(), "`mean` and `action` are needed"),
-        (lambda: R(fixed_matrix=True), "`fixed_matrix` needs state_dim >= obs_dim"),
-    ],
+test_wrong_use_is_refused = refuses(
+    *[(functools.partial(make, **kwargs), message) for make in (Q, R) for kwargs, message in (
+        ({"cov": "scalar"}, "`cov` must be one of diag, full, got 'scalar'"),
+        ({"init_std": 0.01, "min_std": 0.02}, "`min_std` and `init_std` must satisfy"),
+        ({"min_std": 0.0}, "0 < min_std < init_std, got min_std=0"),
+        ({"init_std": float("nan")}, "`min_std` and `init_std` must satisfy"),
+    )],
+    (lambda: Q(activation="gelu"), "`activation` must be one of relu, tanh, got 'gelu'"),
+    (lambda: Q(cov_network=True).cov(), "`mean` and `action` are needed"),
+    (lambda: R(fixed_matrix=True), "`fixed_matrix` needs state_dim >= obs_dim"),
 )  # fmt: skip
-def test_wrong_use_is_refused(use, message):
-    with pytest.raises(ValueError, match=message):
-        use()

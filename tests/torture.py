@@ -9,7 +9,7 @@ kills         50 runs of every belief and algorithm, killed at random moments an
 sweep         8 kills of a sweep and its cells
 full_disk     20 runs of which no file may grow beyond a random size
 flipped_bits  800 flipped bits of a checkpoint
-planted       14 kinds of foreign or damaged files in a run folder
+planted       20 kinds of foreign or damaged files in a run folder
 
 Every run is a process of its own that is killed by SIGKILL at a random moment, resumed, killed
 again, and let go on to its end. It then equals the run that nobody stopped, to the last bit: its
@@ -19,6 +19,7 @@ tables and its last checkpoint. What can't go on says so in one line and leaves 
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import random
 import resource
@@ -29,11 +30,10 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
-from recipe_tools import ROOT, TABLES, differences, make_config, read_table, resume, run
+from recipe_tools import DAMAGED, LAST, ROOT, damage, make_config, resume, run, unequal
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
 from training.console import say
@@ -109,13 +109,6 @@ def finished(folder, words):
     if status != 0:
         raise RuntimeError(f"{folder}: status {status}\n{process.log.read_text()}")
     return time.perf_counter() - process.started
-
-
-def unequal(first, second):
-    """Name what differs in two runs that have ended."""
-    found = [t for t in TABLES if read_table(first / t) != read_table(second / t)]
-    states = [load_checkpoint(last_checkpoint(folder)) for folder in (first, second)]
-    return found + differences(*states)
 
 
 def progress(text):
@@ -262,37 +255,22 @@ def planted(work, draw, count):
     shutil.copytree(straight, seed)
     last_checkpoint(seed).unlink()
 
-    def file_for_folder(folder):
-        shutil.rmtree(folder / "checkpoints")
-        (folder / "checkpoints").write_text("no folder")
-
-    def cut(name, size):
-        return lambda folder: os.truncate(folder / name, size)
-
     def writes(name, data):
         return lambda folder: (folder / name).write_bytes(data)
 
-    def folder_for(name):
-        return lambda folder: ((folder / name).unlink(), (folder / name).mkdir())[1]
-
-    latest = last_checkpoint(seed).relative_to(seed)
-    harmless: dict[str, Callable[[Path], object]] = {
+    harmless = {
         "frames_zzz.pt": writes("checkpoints/frames_zzz.pt", b"\x00\x01"),
         "a stale temporary": writes("checkpoints/.frames_000000000512.pt.tmp", b"half"),
         "a stale table": writes(".metrics.csv.1.tmp", b"half"),
         "half a row": lambda folder: (folder / "metrics.csv").open("a").write("9999,1."),
         "a lost evaluation": lambda folder: (folder / "evaluation.csv").unlink(),
     }
-    harmful: dict[str, Callable[[Path], object]] = {
-        "binary metrics.csv": writes("metrics.csv", bytes(range(256))),
-        "cut header": cut("metrics.csv", 4),
-        "cut checkpoint": cut(str(latest), 5000),
-        "empty checkpoint": cut(str(latest), 0),
-        "binary config.yaml": writes("config.yaml", bytes(range(256))),
-        "empty config.yaml": cut("config.yaml", 0),
-        "a file for the folder of checkpoints": file_for_folder,
-        "a folder for metrics.csv": folder_for("metrics.csv"),
-        "a folder for a checkpoint": folder_for(str(latest)),
+    latest = str(last_checkpoint(seed).relative_to(seed))
+    harmful = {
+        f"{name}: {str(content)[:20]}": functools.partial(
+            damage, name=latest if name == LAST else name, content=content
+        )
+        for name, content, _ in DAMAGED
     }
     wrong, refused, ignored = [], 0, 0
     for number, (name, plant) in enumerate([*harmless.items(), *harmful.items()][:count]):
