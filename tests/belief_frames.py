@@ -36,7 +36,6 @@ class BeliefFrames:
         )
 
     def any_module(self):
-        """Return the module under test."""
         raise NotImplementedError(f"{type(self).__name__} must say in `any_module` what is tested")
 
     def primers(self, module):

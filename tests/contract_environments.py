@@ -85,7 +85,6 @@ def saved(state):
 
 
 def staircase(*transforms, **kwargs):
-    """Return a staircase with transforms."""
     return TransformedEnv(StaircaseEnv(**kwargs), Compose(*transforms))
 
 

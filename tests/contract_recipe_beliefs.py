@@ -9,14 +9,9 @@ from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_drbpn import (
-    BeliefModelLoss,
-    DRBPNLoss,
-    ObservationMissingness,
-    ObservationNoise,
-    PreviousAction,
-)
+from torchrl_drbpn import BeliefModelLoss, DRBPNLoss
 from torchrl_drbpn.modules import MaskedObservationNorm
+from torchrl_drbpn.transforms import ObservationMissingness, ObservationNoise, PreviousAction
 
 LOG_LIKELIHOOD = ("belief", "log_likelihood")
 

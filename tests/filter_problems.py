@@ -13,23 +13,15 @@ from small_agents import make_filter
 from torch import Tensor
 
 from torchrl_drbpn import GaussianTransition, LinearGaussianEmission
-from torchrl_drbpn.functional import (
-    StateSpace,
-    TransitionMLP,
-    filter_sequence,
-    innovation,
-    log_likelihood,
-    native,
-    native_status,
-    update,
-)
+from torchrl_drbpn import functional as F
+from torchrl_drbpn.functional import StateSpace, TransitionMLP, filter_sequence, native
 
 SIZES = [
     pytest.param(3, 7, id="state<obs"),
     pytest.param(4, 4, id="state=obs"),
     pytest.param(6, 3, id="state>obs"),
 ]
-built = pytest.mark.skipif(native_status() is not None, reason="not built")
+built = pytest.mark.skipif(F.native_status() is not None, reason="not built")
 FORMS = ["pytorch", pytest.param("native", marks=built), "step by step"]
 TOLERANCE = 1e-10
 
@@ -64,11 +56,10 @@ def sequences(state, batch=(3,), time=6, obs=5, action=2, seed=0):
 
 def outputs(*step):
     """Residual and innovation covariance, filtered mean and covariance, log-likelihood."""
-    return (*innovation(*step), *update(*step), log_likelihood(*step))
+    return (*F.innovation(*step), *F.update(*step), F.log_likelihood(*step))
 
 
 def make_model(kind, dtype=torch.float64, obs=5, action=2, **options):
-    """A filter of fixed parameters, all away from their starting values."""
     state = {"information": 3, "free": 7, "network": 3}.get(kind, obs)
     place = {"cov": "full", "dtype": dtype}
     if kind == "full":

@@ -11,7 +11,6 @@ OPTIONAL = (("belief", "observation"), ("belief", "latent"), ("belief", "effecti
 
 
 def make_filter(obs=OBS, action=ACTION, dtype=None, **kwargs):
-    """A small filter of fixed parameters."""
     sizes = {"num_particles": K, "hidden_dim": HIDDEN, "latent_dim": LATENT}
     sizes |= {"encoder_sizes": (7, 5), "action_width": 3}
     with torch.random.fork_rng():
@@ -24,7 +23,6 @@ def make_frames(shape, seed=0):
 
 
 def sample_noise(shape, particles, latent, seed):
-    """The float64 noise of independent steps."""
     g = torch.Generator().manual_seed(seed)
     proposal = torch.randn(*shape, particles, latent, generator=g, dtype=torch.float64)
     return ParticleNoise(proposal, torch.rand(*shape, 1, generator=g, dtype=torch.float64))

@@ -102,7 +102,6 @@ def collect(agent, batches=2, dtype=torch.float64, env=None):
 
 
 def make_gae(agent, **kwargs):
-    """TorchRL's GAE through the belief module."""
     keys = {"value_network": agent.value, "deactivate_vmap": True} | kwargs
     return GAE(gamma=GAMMA, lmbda=LMBDA, **keys)
 

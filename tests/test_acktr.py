@@ -18,7 +18,6 @@ SMOKE = ("algo=acktr", "belief=none", "experiment=[smoke,clean]", "algo.critic.s
 
 @pytest.fixture(scope="module")
 def acktr(tmp_path_factory):
-    """Run the smoke experiment once, to its end."""
     folder = tmp_path_factory.mktemp("run") / "smoke"
     assert run(folder, *SMOKE) == 0
     return folder

@@ -15,14 +15,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import torchrl_drbpn
-from torchrl_drbpn import (
-    BeliefFilterModule,
-    BeliefModelLoss,
-    DRBPNLoss,
-    ObservationMissingness,
-    PreviousAction,
-)
+from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss
 from torchrl_drbpn.configs import register
+from torchrl_drbpn.transforms import ObservationMissingness, PreviousAction
 
 GUIDE = Path(__file__).parents[1] / "docs" / "guide"
 SHORT = [
@@ -56,7 +51,6 @@ def _own_store():
 
 
 def nodes():
-    """Every node of a group, by group and name."""
     groups = {
         g: named for g, named in ConfigStore.instance().repo.items() if isinstance(named, dict)
     }

@@ -4,18 +4,9 @@ import importlib
 from pathlib import Path
 
 import pytest
+import small_agents
 import torch
-from small_agents import (
-    ACTION,
-    ENVS,
-    OBS,
-    TIME,
-    add_advantages,
-    collect,
-    make_agent,
-    make_env,
-    make_filter,
-)
+from small_agents import ACTION, ENVS, OBS, TIME, collect, make_agent, make_filter
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -43,16 +34,14 @@ def fresh(loss):
     belief, heads = loss.filter_network, loss.ppo_loss
     agent = make_agent(belief, belief.feature_dim)
     agent.actor, agent.critic = heads.actor_network, heads.critic_network
-    return add_advantages(agent, collect(agent))
+    return small_agents.add_advantages(agent, collect(agent))
 
 
 def sliced(data, length=SLICE, slices=40):
     """Slices as TorchRL's sampler draws and marks them by default, one after the other."""
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(data.numel()),
-        sampler=SliceSampler(slice_len=length, traj_key=TRAJECTORY),
-        batch_size=slices * length,
-    )
+    sampler = SliceSampler(slice_len=length, traj_key=TRAJECTORY)
+    storage = LazyTensorStorage(data.numel())
+    buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=slices * length)
     buffer.extend(data.reshape(-1))
     return buffer.sample()
 
@@ -62,15 +51,12 @@ def test_it_trains_inside_ppotrainer(own_gae):
     torch.manual_seed(0)
     loss = make_loss()
     before = {name: p.detach().clone() for name, p in loss.named_parameters()}
-    collector = Collector(
-        make_env(), loss.actor_network, frames_per_batch=FRAMES, total_frames=4 * FRAMES,
-        auto_register_policy_transforms=True,
-    )  # fmt: skip
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(FRAMES),
-        sampler=SliceSamplerWithoutReplacement(slice_len=SLICE, traj_key=TRAJECTORY),
-        batch_size=8 * SLICE,
-    )
+    options = {"frames_per_batch": FRAMES, "auto_register_policy_transforms": True}
+    env = small_agents.make_env()
+    collector = Collector(env, loss.actor_network, total_frames=4 * FRAMES, **options)
+    sampler = SliceSamplerWithoutReplacement(slice_len=SLICE, traj_key=TRAJECTORY)
+    storage = LazyTensorStorage(FRAMES)
+    buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=8 * SLICE)
     if own_gae:
         loss.make_value_estimator(gamma=0.9, lmbda=0.8)
     seen: list[TensorDictBase] = []

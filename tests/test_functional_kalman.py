@@ -8,13 +8,7 @@ import torch
 from filter_problems import assert_equal, outputs
 
 from torchrl_drbpn import functional as F
-from torchrl_drbpn.functional.gaussian import (
-    Belief,
-    full_cov,
-    inverse_softplus,
-    masked_log_density,
-    positive_std,
-)
+from torchrl_drbpn.functional import Belief
 
 sized = pytest.mark.parametrize(
     ("state", "obs"), [(3, 5), (4, 4), (6, 4)], ids=["state<obs", "state=obs", "state>obs"]
@@ -218,13 +212,13 @@ def test_masked_log_density_is_that_of_the_sub_vector_and_reads_nothing_else(mas
     both = observed.unsqueeze(-1) & observed.unsqueeze(-2)
     for junk in (math.nan, math.inf, -math.inf):
         dirty = torch.where(observed, residual, junk).requires_grad_()
-        actual = masked_log_density(dirty, torch.where(both, cov, junk), observed)
+        actual = F.masked_log_density(dirty, torch.where(both, cov, junk), observed)
         torch.testing.assert_close(actual, expected, atol=1e-11, rtol=1e-11)
         (gradient,) = torch.autograd.grad(actual.sum(), dirty)
         assert not gradient[~observed].any()
         assert gradient.isfinite().all()
     # A count of entries held as an integer times a Python float would be float32.
-    single = masked_log_density(residual.float(), cov.float(), observed)
+    single = F.masked_log_density(residual.float(), cov.float(), observed)
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), actual, atol=1e-4, rtol=1e-5)
 
@@ -232,15 +226,15 @@ def test_masked_log_density_is_that_of_the_sub_vector_and_reads_nothing_else(mas
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_inverse_softplus_undoes_softplus(dtype):
     value = torch.logspace(-6, 3, 40, dtype=dtype)
-    raw = inverse_softplus(value)
+    raw = F.inverse_softplus(value)
     assert torch.isfinite(raw).all()
     torch.testing.assert_close(torch.nn.functional.softplus(raw), value, atol=0, rtol=1e-5)
-    torch.testing.assert_close(positive_std(raw, 1e-2), value + 1e-2)
+    torch.testing.assert_close(F.positive_std(raw, 1e-2), value + 1e-2)
 
 
 def test_float32_full_covariances_can_be_factorised_for_extreme_parameters():
     raw = torch.stack([torch.full((6, 6), value) for value in (-1e4, -10.0, 0.0, 3.0)])
-    factor, info = torch.linalg.cholesky_ex(full_cov(raw, 1e-2))
+    factor, info = torch.linalg.cholesky_ex(F.full_cov(raw, 1e-2))
     assert torch.equal(info, torch.zeros_like(info))
     assert torch.isfinite(factor).all()
 
@@ -250,7 +244,7 @@ def test_every_full_covariance_above_the_floor_can_be_reached_by_a_lower_triangl
         4, dtype=torch.float64
     )
     root = torch.linalg.cholesky(target - 0.01 * torch.eye(4, dtype=torch.float64))
-    raw = root.tril(-1) + torch.diag(inverse_softplus(root.diagonal()))
-    torch.testing.assert_close(full_cov(raw, 0.1), target)
+    raw = root.tril(-1) + torch.diag(F.inverse_softplus(root.diagonal()))
+    torch.testing.assert_close(F.full_cov(raw, 0.1), target)
     spoilt = raw + torch.triu(torch.full((4, 4), 7.0), 1)  # the upper one is not read
-    assert torch.equal(full_cov(raw, 0.1), full_cov(spoilt, 0.1))
+    assert torch.equal(F.full_cov(raw, 0.1), F.full_cov(spoilt, 0.1))

@@ -7,15 +7,7 @@ import pytest
 import torch
 from refusals import refuses
 
-from torchrl_drbpn.functional.missingness import (
-    draw_mechanism,
-    missing_probability,
-    outage_rates,
-    sample_mask,
-    sample_noise,
-    sample_spikes,
-    sample_working,
-)
+from torchrl_drbpn import functional as F
 
 OBS, ACTION = 9, 3
 
@@ -25,7 +17,7 @@ def seeded(seed=0):
 
 
 def mechanism(kind, seed=0, **kwargs):
-    return draw_mechanism(kind, OBS, ACTION, generator=seeded(seed), **kwargs)
+    return F.draw_mechanism(kind, OBS, ACTION, generator=seeded(seed), **kwargs)
 
 
 def example(batch=(4,), seed=5):
@@ -41,7 +33,7 @@ def example(batch=(4,), seed=5):
 def test_the_number_of_always_observed_entries_is_the_rounded_share_and_at_least_one(
     obs, share, count
 ):
-    drawn = draw_mechanism("mar", obs, ACTION, always_observed=share, generator=seeded())
+    drawn = F.draw_mechanism("mar", obs, ACTION, always_observed=share, generator=seeded())
     assert int(drawn.always_observed.sum()) == count
 
 
@@ -57,7 +49,7 @@ def test_mar_and_nmar_share_their_numbers():
 
 
 def test_weights_are_standard_normal():
-    drawn = draw_mechanism("nmar", 120, 40, generator=seeded())
+    drawn = F.draw_mechanism("nmar", 120, 40, generator=seeded())
     for part in (drawn.bias[~drawn.always_observed], drawn.observation_weight, drawn.action_weight):
         n = part.numel()
         assert abs(part.mean()) < 3.5 / math.sqrt(n)
@@ -68,7 +60,7 @@ def test_weights_are_standard_normal():
 @pytest.mark.parametrize("eta", [0.0, 0.3, 1.0])
 def test_probabilities_are_the_formula_entry_by_entry(kind, eta):
     drawn, (x, action) = mechanism(kind), example((2, 3))
-    probability = missing_probability(drawn, x, action, eta)
+    probability = F.missing_probability(drawn, x, action, eta)
     assert probability.shape == x.shape
     for row, column, i in itertools.product(range(2), range(3), range(OBS)):
         logit = float(drawn.bias[i])
@@ -84,14 +76,14 @@ def test_probabilities_are_the_formula_entry_by_entry(kind, eta):
 def test_no_previous_action_is_the_zero_action():
     x, action = example()
     drawn = mechanism("nmar")
-    none = missing_probability(drawn, x, None, 0.9)
-    assert torch.equal(none, missing_probability(drawn, x, torch.zeros_like(action), 0.9))
-    assert not torch.equal(none, missing_probability(drawn, x, action, 0.9))
+    none = F.missing_probability(drawn, x, None, 0.9)
+    assert torch.equal(none, F.missing_probability(drawn, x, torch.zeros_like(action), 0.9))
+    assert not torch.equal(none, F.missing_probability(drawn, x, action, 0.9))
 
 
 @pytest.mark.parametrize("eta", [0.05, 0.3, 0.9])
 def test_the_realised_ratio_of_mcar_is_eta(eta):
-    missing = 1 - sample_mask(eta, torch.zeros(10_000, OBS), seeded(1)).double()
+    missing = 1 - F.sample_mask(eta, torch.zeros(10_000, OBS), seeded(1)).double()
     error = math.sqrt(eta * (1 - eta) / len(missing))
     assert ((missing.mean(0) - eta).abs() < 4 * error).all()
     # and entries go missing independently
@@ -101,8 +93,8 @@ def test_the_realised_ratio_of_mcar_is_eta(eta):
 def test_masks_and_hits_depend_on_the_generator_and_not_on_the_dtype():
     x = torch.zeros(50, OBS)
     for draw in (
-        lambda x, seed: sample_mask(0.5, x, seeded(seed)),
-        lambda x, seed: sample_spikes(0.2, float(x.numel()), x, seeded(seed))[1],
+        lambda x, seed: F.sample_mask(0.5, x, seeded(seed)),
+        lambda x, seed: F.sample_spikes(0.2, float(x.numel()), x, seeded(seed))[1],
     ):
         assert torch.equal(draw(x, 6), draw(x.double(), 6))
         assert not torch.equal(draw(x, 6), draw(x, 7))
@@ -111,13 +103,13 @@ def test_masks_and_hits_depend_on_the_generator_and_not_on_the_dtype():
 def test_a_nan_is_not_hidden_by_the_mask_that_it_would_upset():
     x, action = example()
     x[0, 0] = math.nan
-    observed = sample_mask(missing_probability(mechanism("nmar"), x, action, 0.5), x, seeded())
+    observed = F.sample_mask(F.missing_probability(mechanism("nmar"), x, action, 0.5), x, seeded())
     assert observed[0].all()
 
 
 def test_noise_has_mean_zero_and_the_given_standard_deviation():
     std = torch.tensor([0.0, 0.1, 3.0], dtype=torch.float64)
-    noise = sample_noise(std, torch.zeros(40_000, 3, dtype=torch.float64), seeded(8))
+    noise = F.sample_noise(std, torch.zeros(40_000, 3, dtype=torch.float64), seeded(8))
     assert noise.dtype == torch.float64
     assert (noise[:, 0] == 0).all()
     assert (noise.mean(0).abs() <= 4 * std / math.sqrt(40_000)).all()
@@ -126,11 +118,11 @@ def test_noise_has_mean_zero_and_the_given_standard_deviation():
 
 def chain(eta, mean_length, steps, sensors, seed=0):
     """Return which sensors work, shape (steps, sensors), from the stationary start."""
-    rates, generator = outage_rates(eta, mean_length), seeded(seed)
+    rates, generator = F.outage_rates(eta, mean_length), seeded(seed)
     like = torch.zeros(sensors)
-    rows = [sample_working(None, rates, like, generator)]
+    rows = [F.sample_working(None, rates, like, generator)]
     for _ in range(steps - 1):
-        rows.append(sample_working(rows[-1], rates, like, generator))
+        rows.append(F.sample_working(rows[-1], rates, like, generator))
     return torch.stack(rows)
 
 
@@ -169,7 +161,7 @@ def test_spikes_hit_with_their_probability_and_have_their_deviation():
     probability = torch.tensor([0.0, 0.05, 1.0])
     std = torch.tensor([3.0, 20.0, 0.5], dtype=torch.float64)
     like = torch.zeros(40_000, 3, dtype=torch.float64)
-    error, hit = sample_spikes(probability, std, like, seeded(8))
+    error, hit = F.sample_spikes(probability, std, like, seeded(8))
     assert error.dtype == torch.float64
     assert torch.equal(error != 0, hit)
     off = hit.double().mean(0) - probability
@@ -189,12 +181,12 @@ test_numbers_that_no_law_has_are_refused = refuses(
     (lambda: mechanism("mar", always_observed=math.nan), r"`always_observed` must be a share"),
     (lambda: mechanism("mar", always_observed=1.0), LEAVES),
     (lambda: mechanism("mar", always_observed=0.95), LEAVES),
-    (lambda: draw_mechanism("mar", 1, 2, always_observed=0.0, generator=seeded()), LEAVES),
+    (lambda: F.draw_mechanism("mar", 1, 2, always_observed=0.0, generator=seeded()), LEAVES),
     (lambda: mechanism("mcar"), '`kind` must be "mar" or "nmar"'),
-    (lambda: outage_rates(1.0, 5), r"`eta` must be a share of time in \[0, 1\), got 1.0"),
-    (lambda: outage_rates(-0.1, 5), "`eta` must be a share"),
-    (lambda: outage_rates(math.nan, 5), "`eta` must be a share"),
-    (lambda: outage_rates(0.5, 0.9), "`mean_length` must be the mean length of an outage in"),
-    (lambda: outage_rates(0.5, math.inf), "`mean_length` must be the mean length"),
-    (lambda: outage_rates(0.8, 3.9), r"at least eta / \(1 - eta\) = 4 steps for eta 0.8"),
+    (lambda: F.outage_rates(1.0, 5), r"`eta` must be a share of time in \[0, 1\), got 1.0"),
+    (lambda: F.outage_rates(-0.1, 5), "`eta` must be a share"),
+    (lambda: F.outage_rates(math.nan, 5), "`eta` must be a share"),
+    (lambda: F.outage_rates(0.5, 0.9), "`mean_length` must be the mean length of an outage in"),
+    (lambda: F.outage_rates(0.5, math.inf), "`mean_length` must be the mean length"),
+    (lambda: F.outage_rates(0.8, 3.9), r"at least eta / \(1 - eta\) = 4 steps for eta 0.8"),
 )

@@ -24,7 +24,6 @@ IMAGE = spaces.Box(0, 255, (8, 8, 3), np.uint8)
 
 @pytest.fixture
 def register(monkeypatch):
-    """Register a task for one test."""
     monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
 
     def add(entry_point, **kwargs):

@@ -11,14 +11,7 @@ from tensordict import TensorDict
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_drbpn import BeliefFilter, BeliefFilterModule, BeliefModelLoss, PolicyStep
-from torchrl_drbpn.functional import (
-    Belief,
-    MaskModel,
-    StateSpace,
-    filter_sequence,
-    smooth_sequence,
-    update_by_mask,
-)
+from torchrl_drbpn import functional as F
 
 DOUBLE = {"dtype": torch.float64}
 
@@ -43,9 +36,9 @@ def test_one_missing_entry_has_the_moments_and_probability_of_numerical_integrat
     spread = (weight * (s - exact) ** 2).sum() / Z
 
     vector = lambda x: torch.tensor([x], **DOUBLE)  # noqa: E731
-    after, log_mask = update_by_mask(
-        Belief(vector(mean), vector(P)[None]), vector(math.nan), torch.tensor([False]),
-        vector(h)[None], vector(R), vector(o), MaskModel(vector(a), vector(slope)),
+    after, log_mask = F.update_by_mask(
+        F.Belief(vector(mean), vector(P)[None]), vector(math.nan), torch.tensor([False]),
+        vector(h)[None], vector(R), vector(o), F.MaskModel(vector(a), vector(slope)),
     )  # fmt: skip
     assert_equal(after.mean[0], exact, 1e-6)
     assert_equal(after.cov[0, 0], spread, 1e-6)
@@ -56,7 +49,7 @@ def system(mask_model=None, *, propagated=True):
     """Let s' = .95 s + N(0, .3^2), seen by sensors with a noise of .2."""
     eye = torch.eye(1, **DOUBLE)
     ones = torch.ones(2, 1, **DOUBLE)
-    return StateSpace(
+    return F.StateSpace(
         lambda m, _: 0.95 * m, 0.09 * eye, ones, 0.04 * ones[:, 0], 0 * ones, 0 * ones[:, 0],
         0 * eye[0], eye, 0.95 * eye if propagated else None, mask_model,
     )  # fmt: skip
@@ -87,18 +80,18 @@ def test_learning_why_readings_are_missing_removes_most_of_the_bias():
 
     def loss():
         optimizer.zero_grad()
-        out = filter_sequence(system(MaskModel(*parameters)), *given, cov=cov)
+        out = F.filter_sequence(system(F.MaskModel(*parameters)), *given, cov=cov)
         value = -out.log_likelihood.mean()
         value.backward()
         return value
 
     optimizer.step(loss)
-    learned = MaskModel(*parameters.detach())
+    learned = F.MaskModel(*parameters.detach())
     assert bool((learned.slope < -1.5).all())
     gone = ~given[3].any(-1)
     bias, squared = {}, {}
     for name, mask_model in (("ignored", None), ("learned", learned)):
-        out = filter_sequence(system(mask_model), *given, cov=cov, return_cov=True)
+        out = F.filter_sequence(system(mask_model), *given, cov=cov, return_cov=True)
         error = out.mean[..., 0] - state
         bias[name], squared[name] = error[gone].mean().abs(), error.square().mean()
         nees = (error.square() / out.cov[..., 0, 0]).mean()
@@ -107,7 +100,7 @@ def test_learning_why_readings_are_missing_removes_most_of_the_bias():
     assert bias["ignored"] > 0.3
     assert bias["learned"] < 0.5 * bias["ignored"]
     assert squared["learned"] < 0.7 * squared["ignored"]
-    smoothed = smooth_sequence(system(learned), given[0], None, *given[1:])
+    smoothed = F.smooth_sequence(system(learned), given[0], None, *given[1:])
     assert (smoothed.mean[..., 0] - state)[gone].mean().abs() < 0.5 * bias["ignored"]
 
 
@@ -115,16 +108,16 @@ def test_a_mask_without_a_reason_changes_no_belief_and_adds_its_own_probability(
     _, given = high_readings_are_missing(4, 10)
     cov = torch.zeros(4, 1, 1, **DOUBLE)
     a = torch.tensor([0.7, -1.0], **DOUBLE)
-    plain = filter_sequence(system(), *given, cov=cov)
-    told = filter_sequence(system(MaskModel(a, 0 * a)), *given, cov=cov)
+    plain = F.filter_sequence(system(), *given, cov=cov)
+    told = F.filter_sequence(system(F.MaskModel(a, 0 * a)), *given, cov=cov)
     assert_equal(told.mean, plain.mean)
     assert_equal(told.cov, plain.cov)
     expected = torch.where(given[3], phi(a).log(), phi(-a).log()).sum(-1)
     assert_equal(told.log_likelihood - plain.log_likelihood, expected)
     with pytest.raises(ValueError, match="'native' cannot run here"):
-        filter_sequence(system(MaskModel(a, a)), *given, cov=cov, form="native")
+        F.filter_sequence(system(F.MaskModel(a, a)), *given, cov=cov, form="native")
     with pytest.raises(ValueError, match=r"`mask_model.slope` must have shape \(2,\)"):
-        system(MaskModel(a, a[:1]))
+        system(F.MaskModel(a, a[:1]))
 
 
 def test_gradients_agree_with_finite_differences_at_a_slope_of_zero_too():
@@ -132,8 +125,8 @@ def test_gradients_agree_with_finite_differences_at_a_slope_of_zero_too():
     _, given = high_readings_are_missing(2, 4)
 
     def likelihood(parameters, noise):
-        model = system(MaskModel(*parameters), propagated=False)
-        return filter_sequence(replace(model, emission_cov=noise), *given).log_likelihood
+        model = system(F.MaskModel(*parameters), propagated=False)
+        return F.filter_sequence(replace(model, emission_cov=noise), *given).log_likelihood
 
     noise = torch.tensor([0.04, 0.3], **DOUBLE, requires_grad=True)
     for slope in (-2.0, 1e-3):
@@ -173,7 +166,7 @@ def test_the_module_learns_it_by_the_model_loss_and_steps_are_the_sequence(covar
     with pytest.raises(ValueError, match="`mask_model`, which PolicyStep does not read"):
         PolicyStep(module, torch.nn.Linear(3, 2))
     with pytest.raises(ValueError, match="its belief learns from the mask"):
-        filter_sequence(
+        F.filter_sequence(
             belief_filter.state_space(), torch.zeros(4, 3, **DOUBLE), action, x, observed, reset,
             cov=torch.zeros(4, 3, 3, **DOUBLE), form="native",
         )  # fmt: skip

@@ -10,14 +10,8 @@ from torchrl.envs import Compose, DoubleToFloat, TransformedEnv
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from torchrl_drbpn import (
-    FillLastObserved,
-    GymnasiumBatchEnv,
-    ObservationMissingness,
-    ObservationNoise,
-    seed_env,
-)
-from torchrl_drbpn.modules import MaskedObservationNorm
+from torchrl_drbpn import GymnasiumBatchEnv, MaskedObservationNorm, seed_env
+from torchrl_drbpn.transforms import FillLastObserved, ObservationMissingness, ObservationNoise
 
 ENVS, OBS, ACTION, FRAMES, BATCHES = 4, 4, 1, 64, 4
 

@@ -9,15 +9,7 @@ from torch.distributions import Normal
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_drbpn import ParticleFilterModule
-from torchrl_drbpn.functional import (
-    DiagonalGaussian,
-    ParticleStep,
-    ProposalOutput,
-    StateSpace,
-    filter_sequence,
-    particle_sequence,
-    systematic_ancestors,
-)
+from torchrl_drbpn import functional as F
 from torchrl_drbpn.modules import particle_model
 
 
@@ -88,7 +80,7 @@ def test_many_particles_are_each_by_hand_over_a_resampled_memory():
     died = 0
     for t in range(4):
         frame = data[:, t].unsqueeze(-1).expand(2, K)
-        ancestors = systematic_ancestors(log_weight, noise.resampling[:, t])
+        ancestors = F.systematic_ancestors(log_weight, noise.resampling[:, t])
         died += (ancestors != torch.arange(K)).sum().item()
         hidden = torch.stack([hidden[b, ancestors[b]] for b in range(2)])
         log_q, log_p, seen, hidden, phi = by_hand(filter, hidden, frame, noise.proposal[:, t])
@@ -230,7 +222,7 @@ def test_systematic_resampling_gives_each_particle_its_share_rounded_and_on_aver
     g = torch.Generator().manual_seed(0)
     log_weight = torch.randn(7, generator=g, dtype=torch.float64)
     uniform = (torch.arange(2000, dtype=torch.float64) + 0.5).unsqueeze(-1) / 2000
-    ancestors = systematic_ancestors(log_weight.expand(2000, 7), uniform)
+    ancestors = F.systematic_ancestors(log_weight.expand(2000, 7), uniform)
     share = 7 * log_weight.softmax(-1)
     offspring = torch.nn.functional.one_hot(ancestors, 7).sum(-2).double()
     assert (offspring >= share.floor()).all()
@@ -240,10 +232,10 @@ def test_systematic_resampling_gives_each_particle_its_share_rounded_and_on_aver
 
 def test_equal_weights_keep_every_particle_and_a_zero_weight_none():
     uniform = torch.tensor([[0.01], [0.5], [0.99]])
-    assert systematic_ancestors(torch.zeros(3, 8), uniform).eq(torch.arange(8)).all()
+    assert F.systematic_ancestors(torch.zeros(3, 8), uniform).eq(torch.arange(8)).all()
     log_weight = torch.zeros(3, 4)
     log_weight[:, [0, 3]] = -torch.inf
-    assert systematic_ancestors(log_weight, uniform).tolist() == [[1, 1, 2, 2]] * 3
+    assert F.systematic_ancestors(log_weight, uniform).tolist() == [[1, 1, 2, 2]] * 3
 
 
 class LinearGaussian:
@@ -261,14 +253,14 @@ class LinearGaussian:
     def propose(self, hidden, inputs):
         mean = hidden @ self.A.mT + inputs[0].unsqueeze(-2) @ self.B.mT
         variance = self.Q.expand_as(mean)
-        return ProposalOutput(
-            DiagonalGaussian(mean, 1.5 * variance), DiagonalGaussian(mean, variance)
+        return F.ProposalOutput(
+            F.DiagonalGaussian(mean, 1.5 * variance), F.DiagonalGaussian(mean, variance)
         )
 
     def step(self, latent, hidden, inputs):
         del hidden, inputs
-        emission = DiagonalGaussian(self.c * latent, self.R.expand_as(latent))
-        return ParticleStep(emission, latent, latent)
+        emission = F.DiagonalGaussian(self.c * latent, self.R.expand_as(latent))
+        return F.ParticleStep(emission, latent, latent)
 
     def run(self, data, particles, seeds):
         """Log-likelihood of the rows of `data`, (seeds, rows, time)."""
@@ -276,7 +268,7 @@ class LinearGaussian:
         noise = sample_noise(x.shape[:-1], particles, 3, particles)
         hidden = x.new_zeros(*x.shape[:-1], particles, 3)
         begin = torch.zeros(x.shape[:-1], dtype=torch.bool)
-        return particle_sequence(
+        return F.particle_sequence(
             self, hidden, hidden[..., 0], begin, (action,), x, m, noise
         ).log_likelihood
 
@@ -284,12 +276,12 @@ class LinearGaussian:
         """The same from the filter that carries the covariance along, (rows, time)."""
         x, m, action = data
         zero, start = x.new_zeros(3, 2), x.new_zeros(len(x), 3)
-        model = StateSpace(
+        model = F.StateSpace(
             lambda s, a: s @ self.A.mT + a @ self.B.mT, self.Q.diag(), self.c.diag(), self.R, zero,
             zero[:, 0], zero[:, 0], self.Q.diag(), self.A,
         )  # fmt: skip
         reset, cov = torch.zeros(x.shape[:2], dtype=torch.bool), x.new_zeros(len(x), 3, 3)
-        return filter_sequence(model, start, action, x, m, reset, cov=cov).log_likelihood
+        return F.filter_sequence(model, start, action, x, m, reset, cov=cov).log_likelihood
 
 
 def linear_data(rows, time):

@@ -6,14 +6,8 @@ from filter_problems import make_model, sequences
 from tensordict import TensorDict
 from torch import nn
 
-from torchrl_drbpn import (
-    BeliefFilter,
-    BeliefFilterModule,
-    GaussianTransition,
-    LinearGaussianEmission,
-    PolicyStep,
-)
-from torchrl_drbpn.modules import MaskedObservationNorm
+from torchrl_drbpn import BeliefFilter, BeliefFilterModule, PolicyStep
+from torchrl_drbpn.modules import GaussianTransition, LinearGaussianEmission, MaskedObservationNorm
 
 OBS, ACTION, BATCH, TIME = 5, 2, 3, 12
 

@@ -7,21 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import recipe_tools
 import torch
 from contracts import saved
 from evaluation.trained import evaluate_training
 from ppo_drbpn import train_rollout
-from recipe_tools import (
-    ROOT,
-    SMOKE,
-    assembled,
-    assert_same_run,
-    command,
-    differences,
-    read_table,
-    refused,
-    run,
-)
+from recipe_tools import SMOKE, assembled, assert_same_run, differences, read_table, refused, run
 from tqdm import tqdm
 from training.checkpoint import last_checkpoint
 from training.console import BAR, show
@@ -126,7 +117,7 @@ def test_evaluation_leaves_the_whole_training_alone():
 
 def test_the_command_runs_from_any_directory(tmp_path):
     words = ("experiment=smoke", "total_frames=128", "evaluation.final_episodes=1")
-    done = command("recipes/ppo_drbpn.py", *words, cwd=tmp_path)
+    done = recipe_tools.command("recipes/ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "steps/s in collection and update" in done.stdout
     (folder,) = (tmp_path / "runs").iterdir()
@@ -145,7 +136,7 @@ def test_the_command_runs_from_any_directory(tmp_path):
     ],
 )
 def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(tmp_path, words, line):
-    done = command("recipes/ppo_drbpn.py", *words, cwd=tmp_path)
+    done = recipe_tools.command("recipes/ppo_drbpn.py", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert line in done.stderr
@@ -180,7 +171,7 @@ def test_the_progress_bar_has_room_on_100_columns():
 def test_a_closed_pipe_does_not_stop_a_run(tmp_path):
     words = [*SMOKE, "total_frames=256", "hydra.run.dir=run", "evaluation.every_frames=0"]
     job = subprocess.Popen(
-        [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), *words],
+        [sys.executable, str(recipe_tools.ROOT / "recipes" / "ppo_drbpn.py"), *words],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

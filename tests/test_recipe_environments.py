@@ -102,7 +102,6 @@ LINE = "InvertedPendulum-v5 can't save its state here: going on with new episode
 
 @pytest.fixture(scope="module")
 def half(tmp_path_factory):
-    """Run the first half of the smoke experiment once."""
     folder = tmp_path_factory.mktemp("run") / "half"
     assert run(folder, *ENVPOOL, "total_frames=256") == 0
     return folder

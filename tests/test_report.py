@@ -39,7 +39,6 @@ HOPPER = ("env=hopper", "env.version=v4", "total_frames=400")
 
 
 def make_run(folder, *overrides, seed=0, final=50.0, frames=FRAMES, points=None):
-    """Write what a run leaves behind."""
     folder.mkdir(parents=True)
     write_config(folder, OmegaConf.merge(make_config(*HOPPER, *overrides), {"seed": seed}))
     (folder / "versions.json").write_text(json.dumps({"torch": "2.13.0", "git_commit": "abc"}))

@@ -10,15 +10,10 @@ import torch
 from filter_problems import by_hand, make_model, sequences
 from torch import nn
 
-from torchrl_drbpn import (
-    BeliefDivergedError,
-    BeliefFilter,
-    BeliefFilterModule,
-    GaussianTransition,
-    PolicyStep,
-)
+from torchrl_drbpn import BeliefDivergedError, BeliefFilter, BeliefFilterModule, PolicyStep
 from torchrl_drbpn.functional import innovation_weights, robust_sequence_weights
 from torchrl_drbpn.functional.robust import Robust
+from torchrl_drbpn.modules import GaussianTransition
 
 OBS, ACTION, BATCH, TIME = 5, 2, 6, 5
 MODELS = ["innovation", "information", "free", "full", "network", "propagated"]

@@ -13,21 +13,9 @@ import time
 
 import ppo_drbpn
 import pytest
+import recipe_tools
 import torch
-from recipe_tools import (
-    CHECKPOINT,
-    DAMAGED,
-    SMOKE,
-    TABLES,
-    assembled,
-    assert_same_run,
-    damage,
-    make_config,
-    read_table,
-    refused,
-    resume,
-    run,
-)
+from recipe_tools import SMOKE, assert_same_run, read_table, refused, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.errors import UserError
 from training.run_folder import Table, read_config
@@ -49,7 +37,7 @@ def test_the_command_that_a_refusal_prints_goes_on_with_that_folder(smoke, tmp_p
     with pytest.raises(UserError) as error:
         run(folder, *SMOKE)
     (word,) = shlex.split(str(error.value).removesuffix(".").split("or ")[-1])
-    assert make_config(word).resume == str(folder)
+    assert recipe_tools.make_config(word).resume == str(folder)
 
 
 def test_a_folder_of_a_run_without_a_checkpoint_is_refused_without_a_promise(folder):
@@ -73,9 +61,9 @@ def test_a_file_where_a_folder_should_be_is_named(tmp_path):
         run(tmp_path / "run" / "below", *SMOKE)
 
 
-@pytest.mark.parametrize(("name", "content", "line"), DAMAGED)
+@pytest.mark.parametrize(("name", "content", "line"), recipe_tools.DAMAGED)
 def test_what_is_damaged_is_named_and_stays_as_it_is(folder, name, content, line):
-    damage(folder, name, content)
+    recipe_tools.damage(folder, name, content)
     before = contents(folder)
     with refused(line):
         resume(folder, "total_frames=640")
@@ -89,7 +77,7 @@ def test_a_flipped_bit_in_a_checkpoint_is_refused_and_the_one_before_is_named(fo
         data = bytearray(whole)
         data[place // 8] ^= 1 << place % 8
         path.write_bytes(data)
-        with refused(CHECKPOINT):
+        with refused(recipe_tools.CHECKPOINT):
             load_checkpoint(path)
         assert path.read_bytes() == data
 
@@ -158,7 +146,7 @@ def test_a_run_folder_of_the_first_version_is_refused_by_the_commit_that_reads_i
 )
 def test_a_checkpoint_of_another_shape_is_refused(smoke, overrides):
     state = load_checkpoint(last_checkpoint(smoke))
-    training, _ = assembled(*SMOKE, *overrides)
+    training, _ = recipe_tools.assembled(*SMOKE, *overrides)
     with refused("does not fit the settings of this run"):
         training.load_state_dict(state, "there")
 
@@ -179,7 +167,7 @@ def test_a_resumed_run_equals_one_that_never_stopped(overrides, tmp_path):
     # The machine stopped after the second rollout's checkpoint, in the middle of a later row.
     last_checkpoint(broken).unlink()
     assert last_checkpoint(broken).name == "frames_000000000256.pt"
-    for table in TABLES:
+    for table in recipe_tools.TABLES:
         with (broken / table).open("a") as file:
             file.write("640,1.")
     assert resume(broken) == 0

@@ -14,22 +14,13 @@ from typing import Any
 
 import hydra
 import pytest
+import recipe_tools
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.cell_sweeper import CellSweeper, continued, run_cell
 from omegaconf import OmegaConf
 from ppo_drbpn import train
-from recipe_tools import (
-    CONF,
-    ROOT,
-    assert_same_run,
-    command,
-    differences,
-    make_config,
-    read_table,
-    refused,
-    run,
-)
+from recipe_tools import CONF, command, make_config, read_table, refused, run
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.console import STOP_FILE, stop_request
@@ -200,7 +191,7 @@ def test_what_fails_ends_no_other_and_launchers_run_the_same_cells_to_the_same_b
         (made[launcher],) = (tmp_path / launcher / "out").glob("*lr-0.001*")
     first = load_checkpoint(last_checkpoint(made.pop("basic")))
     for folder in made.values():
-        assert not differences(first, load_checkpoint(last_checkpoint(folder)))
+        assert not recipe_tools.differences(first, load_checkpoint(last_checkpoint(folder)))
 
 
 def test_slurm_gets_one_array_with_a_task_for_each_cell(tmp_path):
@@ -237,7 +228,13 @@ def test_slurm_gets_one_array_with_a_task_for_each_cell(tmp_path):
 @pytest.fixture
 def start(tmp_path):
     """Start a sweep in a process group of its own; nothing of it is left at the end."""
-    line = [sys.executable, str(ROOT / "recipes" / "ppo_drbpn.py"), "-m", "study=smoke", *LONG]
+    line = [
+        sys.executable,
+        str(recipe_tools.ROOT / "recipes" / "ppo_drbpn.py"),
+        "-m",
+        "study=smoke",
+        *LONG,
+    ]
     started: list[subprocess.Popen[str]] = []
 
     def begin(*words):
@@ -293,4 +290,4 @@ def test_a_sweep_goes_on_after_it_was_killed(start, tmp_path):
         said, _ = again.communicate(timeout=240)
         assert again.returncode == 0, said
         assert (f"going on at {reached:,} steps" in said) == (where == "out")
-    assert_same_run(tmp_path / "straight" / folder.name, folder)
+    recipe_tools.assert_same_run(tmp_path / "straight" / folder.name, folder)

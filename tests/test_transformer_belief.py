@@ -11,7 +11,6 @@ MEMORY, LENGTH = ("recurrent", "memory"), ("recurrent", "length")
 
 
 def make_module(**sizes):
-    """Return a transformer in float64."""
     from training.config import build, choice
 
     sizes = {"window": 4, "width": 16, "layers": 1, **sizes}

@@ -88,7 +88,6 @@ class Process:
         return None
 
     def is_one_line(self):
-        """Return whether it ended in one line of an error."""
         text = self.log.read_text(errors="replace")
         return text.count("error: ") == 1 and "Traceback" not in text
 
@@ -112,7 +111,6 @@ def finished(folder, words):
 
 
 def progress(text):
-    """Print how far a class has got."""
     print(f"  {text}", file=sys.stderr, flush=True)  # noqa: T201
 
 
@@ -309,7 +307,6 @@ CLASSES = {
 
 
 def main():
-    """Run every class; return the status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
