@@ -2,6 +2,7 @@
 
 import torch
 from contract_environments import ACTION, OBS
+from filter_problems import assert_equal
 from tensordict import TensorDict
 from torchrl.envs import Compose
 from torchrl.modules import set_recurrent_mode
@@ -25,15 +26,10 @@ class BeliefFrames:
         g = torch.Generator().manual_seed(seed)
         observed = torch.rand(*shape, obs, generator=g) < 0.6
         observation = torch.randn(*shape, obs, generator=g, dtype=dtype)
-        return TensorDict(
-            {
-                self.observation: torch.where(observed, observation, 0.0),
-                "observed": observed,
-                "previous_action": torch.randn(*shape, action, generator=g, dtype=dtype),
-                "is_init": torch.zeros(*shape, 1, dtype=torch.bool),
-            },
-            shape,
-        )
+        data = {self.observation: torch.where(observed, observation, 0.0), "observed": observed}
+        data["previous_action"] = torch.randn(*shape, action, generator=g, dtype=dtype)
+        data["is_init"] = torch.zeros(*shape, 1, dtype=torch.bool)
+        return TensorDict(data, shape)
 
     def any_module(self):
         raise NotImplementedError(f"{type(self).__name__} must say in `any_module` what is tested")
@@ -90,13 +86,7 @@ class BeliefFrames:
             limit = self.tolerance64 if dtype == torch.float64 else self.tolerance32
             # The largest entry sets the scale: beliefs of raw sensors may be far from 1.
             scale = max(1.0, expected[key].abs().max().item())
-            torch.testing.assert_close(
-                received[key],
-                expected[key],
-                rtol=limit,
-                atol=limit * scale,
-                msg=lambda text, key=key: f"{key}: {text}",
-            )
+            assert_equal(received[key], expected[key], limit, str(key), scale)
 
     def test_every_out_key_is_written_no_other_and_no_input_is_changed(self):
         module = self.any_module()

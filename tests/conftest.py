@@ -21,6 +21,11 @@ def pytest_configure(config):
         subprocess.run(build, cwd=ROOT, check=False)
 
 
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+
+
 @pytest.fixture(scope="session")
 def smoke(tmp_path_factory):
     """Run the smoke experiment of the recipe once, to its end; nobody may change its folder."""

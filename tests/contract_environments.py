@@ -1,5 +1,6 @@
 """Environments and helpers that the contracts share; see contracts.py."""
 
+import copy
 import io
 
 import torch
@@ -82,6 +83,19 @@ def saved(state):
     torch.save(state, buffer)
     buffer.seek(0)
     return torch.load(buffer, weights_only=True)
+
+
+def heirs(first, second, run):
+    """Return what `second` and a copy give with the state of `first`, and what `first` gave."""
+    with torch.no_grad():
+        for parameter in first.parameters():
+            parameter += 0.05
+    second.load_state_dict(saved(first.state_dict()))
+    copied, expected = copy.deepcopy(first), run(first)
+    with torch.no_grad():
+        for parameter in first.parameters():  # which a copy does not share
+            parameter.zero_()
+    return [run(second), run(copied)], expected
 
 
 def staircase(*transforms, **kwargs):

@@ -55,22 +55,16 @@ class RecipeBeliefContract(BeliefFrames):
 
     def make_env(self):
         """Return four rows dressed as the recipe does, two that terminate, one that is cut off."""
-        transforms = (
-            PreviousAction(),
-            ObservationNoise(100.0),
-            ObservationMissingness("mcar", 0.5, always_observed=0.0),
-            StepCounter(max_steps=5),
-            InitTracker(),
-        )
-        return TransformedEnv(StaircaseEnv(4), Compose(*transforms))
+        gaps, steps = ObservationMissingness("mcar", 0.5, always_observed=0.0), StepCounter(5)
+        chain = Compose(PreviousAction(), ObservationNoise(100.0), gaps, steps, InitTracker())
+        return TransformedEnv(StaircaseEnv(4), chain)
 
     def collected(self, belief):
         """Return heads and a rollout whose rows begin in mid-episode, with ends of both kinds."""
         norm = MaskedObservationNorm(OBS)
         norm.update(self.make_env().rollout(40, break_when_any_done=False))
-        agent = small_agents.make_agent(
-            belief.module, belief.feature_dim, dtype=torch.float32, actions=ACTION, norm=norm
-        )
+        options = {"dtype": torch.float32, "actions": ACTION, "norm": norm}
+        agent = small_agents.make_agent(belief.module, belief.feature_dim, **options)
         data = small_agents.collect(agent, env=self.make_env())
         norm(data["next"])
         assert data.shape == (4, 18)

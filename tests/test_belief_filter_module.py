@@ -14,14 +14,8 @@ from torchrl.modules import set_recurrent_mode
 
 from torchrl_drbpn import BeliefFilter, BeliefFilterModule, LinearGaussianEmission, functional
 
-OPTIONAL = (
-    ("belief", "cov"),
-    ("belief", "observation"),
-    ("belief", "predicted_observation"),
-    ("belief", "innovation_cov"),
-)
-
-
+NAMES = ("cov", "observation", "predicted_observation", "innovation_cov")
+OPTIONAL = tuple(("belief", name) for name in NAMES)
 make_filter = functools.partial(make_any_filter, OBS, ACTION)
 
 
@@ -44,53 +38,47 @@ def with_state(frames, state):
 class TestContract(BeliefModuleContract):
     all_outputs = ("features", ("belief", "log_likelihood"), *OPTIONAL)
 
+    filter, policy_input = staticmethod(make_any_filter), "mean"
+
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        return BeliefFilterModule(make_any_filter(obs, action, dtype), **kwargs)
+        kwargs = {"policy_input": self.policy_input, **kwargs}
+        return BeliefFilterModule(self.filter(obs, action, dtype), **kwargs)
 
     def differentiable(self, out):
         return out["features"].square().mean() - out["belief", "log_likelihood"].mean()
 
 
-class TestContractOfTheInformationForm(TestContract):
+class Further(TestContract):
+    test_it_runs_in_batched_environments = None  # once is enough
+
+
+class TestContractOfTheInformationForm(Further):
     """State smaller than obs; the covariance in the features."""
 
-    test_it_runs_in_batched_environments = None  # once is enough
+    filter, policy_input = staticmethod(functools.partial(make_any_filter, state=3)), "mean_cov"
     test_compiled_without_a_graph_break_equals_eager = None  # the other two do
 
-    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        belief = make_any_filter(obs, action, dtype, state=3)
-        return BeliefFilterModule(belief, policy_input="mean_cov", **kwargs)
 
-
-class TestContractOfANetworkCovariance(TestContract):
+class TestContractOfANetworkCovariance(Further):
     """Q depends on the state: the filter runs step by step."""
 
-    test_it_runs_in_batched_environments = None  # once is enough
-
-    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        belief = make_any_filter(obs, action, dtype, state=3, cov_network=True)
-        return BeliefFilterModule(belief, **kwargs)
+    filter = staticmethod(functools.partial(make_any_filter, state=3, cov_network=True))
 
 
-class TestContractOfAPropagatedCovariance(TestContract):
+PROPAGATED = functools.partial(make_any_filter, covariance="propagated")
+
+
+class TestContractOfAPropagatedCovariance(Further):
     """The recurrent state holds the covariance."""
 
-    test_it_runs_in_batched_environments = None  # once is enough
-
-    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        belief = make_any_filter(obs, action, dtype, covariance="propagated")
-        return BeliefFilterModule(belief, **kwargs)
+    filter = staticmethod(PROPAGATED)
 
 
-class TestContractOfARobustUpdate(TestContract):
+class TestContractOfARobustUpdate(Further):
     """Readings are weighed by the belief of each step; most weights are under 1."""
 
-    test_it_runs_in_batched_environments = None  # once is enough
+    filter = staticmethod(functools.partial(PROPAGATED, robust="huber", robust_threshold=0.5))
     test_a_reading_that_is_not_usable_is_named = None  # huge ones are: test_robust_update.py
-
-    def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):
-        options = {"covariance": "propagated", "robust": "huber", "robust_threshold": 0.5}
-        return BeliefFilterModule(make_any_filter(obs, action, dtype, **options), **kwargs)
 
 
 def test_the_keys_are_those_of_the_contract_and_a_list_renames_them_by_position():
@@ -119,10 +107,8 @@ def test_the_recurrent_state_can_be_renamed_and_carries_the_belief():
 
 
 def test_out_keys_as_a_list_or_a_dict_choose_what_is_written_and_computed(monkeypatch):
-    data, make = (
-        with_state(make_frames((3,)), OBS),
-        functools.partial(make_filter, dtype=torch.float64),
-    )
+    data = with_state(make_frames((3,)), OBS)
+    make = functools.partial(make_filter, dtype=torch.float64)
     chosen = {"features": ("a", "b"), ("belief", "cov"): "sigma"}
     module = BeliefFilterModule(make(), out_keys=chosen)
     assert module.out_keys[:2] == [("a", "b"), "sigma"]

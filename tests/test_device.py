@@ -82,7 +82,6 @@ def test_normalisation_and_the_robots_step_stay_with_their_input():
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("overrides", [(), ("belief=gru",), ("belief=dvrl",), ("method=acktr",)])
 def test_a_run_on_a_gpu_goes_on_on_the_cpu_and_back(overrides, tmp_path):
     folder = tmp_path / "run"

@@ -130,11 +130,11 @@ def test_a_truncated_row_may_be_stepped_on():
 
 
 test_what_envpool_does_not_have_is_refused = refuses(
-    (lambda: EnvPoolBatchEnv("CartPole-v1", 1), ValueError, "action space .* got Discrete"),
-    (lambda: EnvPoolBatchEnv("CheetahRun-v1", 1), ValueError, "got Dict.*`observation_keys`"),
+    (lambda: EnvPoolBatchEnv("CartPole-v1", 1), "action space .* got Discrete"),
+    (lambda: EnvPoolBatchEnv("CheetahRun-v1", 1), "got Dict.*`observation_keys`"),
     (lambda: EnvPoolBatchEnv("Swimmer-v5", 1, render_mode="rgb_array"), TypeError,
      r"takes no \['render_mode'\]"),
-    (lambda: EnvPoolBatchEnv("Swimmer-v5", 1).reset(options={"x": 1}), ValueError, "no `opti"),
+    (lambda: EnvPoolBatchEnv("Swimmer-v5", 1).reset(options={"x": 1}), "no `opti"),
 )  # fmt: skip
 
 

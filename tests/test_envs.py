@@ -183,7 +183,6 @@ def test_closing_twice_is_an_error_unless_allowed(backend):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_tensors_come_out_on_the_device_asked_for(backend):
     env = backend("Hopper-v5", 2, seed=0, device="cuda")
     check_env_specs(env)

@@ -58,13 +58,10 @@ def test_sac_learns_from_corrupted_observations(missing):
         optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
         buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), batch_size=32)
         before = [parameter.detach().clone() for parameter in actor.parameters()]
-        collector = Collector(
-            make_env(filling),
-            TensorDictSequential(norm, actor),
-            frames_per_batch=FRAMES,
-            total_frames=BATCHES * FRAMES,
-            auto_register_policy_transforms=False,
-        )
+        sizes = {"frames_per_batch": FRAMES, "total_frames": BATCHES * FRAMES}
+        policy = TensorDictSequential(norm, actor)
+        options = sizes | {"auto_register_policy_transforms": False}
+        collector = Collector(make_env(filling), policy, **options)
         losses = []
         try:
             for data in collector:

@@ -92,12 +92,8 @@ def test_a_robust_filter_is_the_textbook_in_values_and_all_gradients(kind, robus
     truth, found = ((x.mean, x.cov, x.log_likelihood) for x in (expected, out))
     for value, expected in zip(found, truth, strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-7, atol=1e-7)
-    gradients = [
-        torch.autograd.grad(
-            sum((x.sin().sum() for x in outputs), torch.zeros(())), list(model.parameters())
-        )
-        for outputs in (found, truth)
-    ]
+    totals = [sum(x.sin().sum() for x in outputs) for outputs in (found, truth)]
+    gradients = [torch.autograd.grad(total, list(model.parameters())) for total in totals]
     for value, expected in zip(*gradients, strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-6)
 
@@ -178,10 +174,8 @@ def test_where_all_readings_agree_on_another_state_the_belief_follows_them(robus
     _, action, observation, observed, reset = first(inputs(model, wrong=0.0))
     given = (action, observation, torch.ones_like(observed), torch.zeros_like(reset))
     lost = torch.full((BATCH, OBS), 1e4, dtype=torch.float64)
-    follows, free = (
-        model.step(lost, None, *given).mean,
-        make_model("innovation").step(lost, None, *given).mean,
-    )
+    follows = model.step(lost, None, *given).mean
+    free = make_model("innovation").step(lost, None, *given).mean
     predicted = model.predict(lost, action, torch.zeros_like(reset)).mean
     assert (follows - free).norm() < 0.2 * (predicted - free).norm()
 

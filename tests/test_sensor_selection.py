@@ -178,10 +178,8 @@ test_bad_input_is_refused_in_one_line = refuses(
     ({"emission_cov": torch.ones(2)}, r"`emission_cov` must be of shape.*3, 3.*got \(2, 2\)"),
     ({"emission_cov": torch.tensor([1.0, 0, 1])}, "`emission_cov` must be .*positive definite"),
     ({"emission_cov": -EYE}, "`emission_cov` must be .* positive definite"),
-    (
-        {"emission_matrix": torch.ones(2, 3, 3), "predicted_cov": EYE.expand(4, 3, 3)},
-        r"must have batch shapes that broadcast, got \(2,\), \(4,\), \(\)",
-    ),
+    ({"emission_matrix": torch.ones(2, 3, 3), "predicted_cov": EYE.expand(4, 3, 3)},
+     r"must have batch shapes that broadcast, got \(2,\), \(4,\), \(\)"),
     ({"count": 4}, "`count` must be an int from 0 to 3, .*got 4"),
     ({"count": 3, "always": [0]}, "`count` must be an int from 0 to 2, .*got 3"),
     ({"count": 1.0}, "`count` must be an int from 0"),
@@ -192,11 +190,7 @@ test_bad_input_is_refused_in_one_line = refuses(
     ({"always": [0.5]}, "`always` must be a list of indices, or 3 bools"),
     ({"target": EYE}, "`target` weighs the trace: it needs criterion='A'"),
     ({"criterion": "A", "target": torch.eye(2)}, "`target` must be finite and of shape"),
-    (
-        {"criterion": "A", "target": EYE.expand(2, 3, 3)},
-        r"`target` must be .* the batch shape \(\) of the model or none, got \(2, 3, 3\)",
-    ),
-    make=partial(
-        select_sensors, emission_matrix=EYE, predicted_cov=EYE, emission_cov=EYE, count=1
-    ),
+    ({"criterion": "A", "target": EYE.expand(2, 3, 3)},
+     r"`target` must be .* the batch shape \(\) of the model or none, got \(2, 3, 3\)"),
+    make=partial(select_sensors, emission_matrix=EYE, predicted_cov=EYE, emission_cov=EYE, count=1),
 )  # fmt: skip

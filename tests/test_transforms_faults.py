@@ -28,12 +28,8 @@ GROUPS = [[0, 3], [-1]]
 def collected(*transforms, steps=40, batch=3, horizon=7):
     """Steps of a collector, whose rollouts cut episodes and whose episodes end row by row."""
     env = staircase(*transforms, StepCounter(), batch=batch, horizon=horizon)
-    collector = Collector(
-        env,
-        frames_per_batch=batch * steps // 2,
-        total_frames=batch * steps,
-        auto_register_policy_transforms=False,
-    )
+    sizes = {"frames_per_batch": batch * steps // 2, "total_frames": batch * steps}
+    collector = Collector(env, **sizes, auto_register_policy_transforms=False)
     data = torch.cat([batch.clone() for batch in collector], 1)
     collector.shutdown()
     return data
@@ -328,12 +324,8 @@ def test_a_nested_observation_has_mask_and_state_beside_it():
 def test_two_of_them_need_two_states():
     with pytest.raises(ValueError, match=r"`sensor_on` is among .* Pass another key"):
         _ = staircase(SensorOutages(0.2, 5), SensorOutages(0.2, 20)).observation_spec
-    env = staircase(
-        SensorOutages(0.2, 5),
-        SensorOutages(0.2, 20, groups=[[0, 1, 2, 3, 4]], state_keys="bus_on"),
-        batch=500,
-        horizon=20,
-    )
+    bus = SensorOutages(0.2, 20, groups=[[0, 1, 2, 3, 4]], state_keys="bus_on")
+    env = staircase(SensorOutages(0.2, 5), bus, batch=500, horizon=20)
     rollout = env.rollout(10)
     assert torch.equal(rollout["observed"], rollout["sensor_on"] & rollout["bus_on"])
     # 1 - .8 * .8; a group is one draw for five entries

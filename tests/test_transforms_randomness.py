@@ -152,7 +152,6 @@ def test_classes_with_the_same_seed_are_unrelated():
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("seed", [None, 0])
 @pytest.mark.parametrize("mechanism", ["mcar", "nmar"])
 def test_data_on_a_gpu_stays_there_with_the_same_mechanism(mechanism, seed):

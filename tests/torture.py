@@ -41,19 +41,18 @@ from training.errors import UserError
 
 SMALL = ("experiment=smoke", "total_frames=768", "checkpoint.every_frames=128",
          "missingness=mcar", "missingness.eta=0.3")  # fmt: skip
+ACKTR = ("algo=acktr", "algo.critic.steps=3", "collector.num_envs=4", "collector.steps_per_env=32")
 DVRL = ("belief.num_particles=3", "belief.hidden_dim=16", "belief.latent_dim=8")
 CASES = {
     "drbpn": ("belief=drbpn",),
-    "fill acktr": ("belief=fill", "algo=acktr", "algo.critic.steps=3", "collector.num_envs=4",
-                   "collector.steps_per_env=32"),
+    "fill acktr": ("belief=fill", *ACKTR),
     "gru": ("belief=gru", "env=hopper", "missingness=mar"),
     "transformer": ("belief=transformer", "missingness=outages"),
     "none": ("belief=none", "missingness=nmar"),
     "fill": ("belief=fill", "noise=spikes"),
     "dvrl": ("belief=dvrl", *DVRL),
-    "none acktr": ("belief=none", "algo=acktr", "algo.critic.steps=3", "collector.num_envs=4",
-                   "collector.steps_per_env=32"),
-}  # fmt: skip
+    "none acktr": ("belief=none", *ACKTR),
+}
 
 
 class Process:
