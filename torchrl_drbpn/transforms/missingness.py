@@ -192,7 +192,7 @@ class SensorReduction(CorruptingTransform):
         if not whole or tensor.ndim == 0 or (tensor.ndim > 1 and tensor.dtype != torch.bool):
             raise ValueError(
                 "`missing` must be a list of indices, or bool of shape (obs,) or (*batch, obs), "
-                f"True where there is no sensor, got {missing!r}."
+                f"True where there is no sensor, got {tensor.dtype} of shape {tuple(tensor.shape)}."
             )
         self.missing = tensor
 
