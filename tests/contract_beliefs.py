@@ -2,7 +2,6 @@
 
 import warnings
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -34,8 +33,8 @@ class BeliefModuleContract(BeliefModuleRefusals):
     of the step before is taken.
     """
 
-    age_key: Any = ("recurrent", "age")  # counts updates since the reset
-    all_outputs: Any = None  # every entry that the module can write
+    age_key = ("recurrent", "age")  # counts updates since the reset
+    all_outputs = None  # every entry that the module can write
 
     # --- hooks
     def differentiable(self, out):

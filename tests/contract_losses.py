@@ -10,8 +10,8 @@ from contract_environments import heirs
 class LossContract:
     """Duties of a loss: what a TorchRL LossModule promises."""
 
-    has_networks: bool = True
-    reductions: tuple[str, ...] = ()  # that the constructor takes; none where held losses decide
+    has_networks = True
+    reductions = ()  # that the constructor takes; none where held losses decide
 
     # --- hooks
     def make_loss(self, **kwargs):

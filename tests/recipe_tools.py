@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from ppo_drbpn import assemble, collect, train
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.config import composed_config
 from training.errors import UserError
@@ -81,16 +82,12 @@ def refused(line):
 
 def run(folder, *overrides):
     """Train as a command line does, and leave torch's generator alone."""
-    from ppo_drbpn import train
-
     with torch.random.fork_rng(devices=[]):
         return train(make_config(*overrides), folder)
 
 
 def resume(folder, *overrides):
     """Go on with a run as ``resume=<folder>`` does."""
-    from ppo_drbpn import train
-
     config = resumed_config(make_config(*overrides), ["resume=x", *overrides], folder)
     with torch.random.fork_rng(devices=[]):
         return train(config, folder)
@@ -98,10 +95,16 @@ def resume(folder, *overrides):
 
 def assembled(*overrides):
     """Build the parts of a run, and return its configuration beside them."""
-    from ppo_drbpn import assemble
-
     config = make_config(*overrides)
     return assemble(config), config
+
+
+def second_rollout(*overrides):
+    """Return a training, and its second rollout after one for the statistics of its norm."""
+    training, _ = assembled(*overrides)
+    training.agent.norm.update(collect(training))
+    collect(training)
+    return training, collect(training).clone()
 
 
 def make_folder(folder, *overrides):
@@ -114,15 +117,9 @@ def make_folder(folder, *overrides):
 
 def command(script, *words, cwd, **env):
     """Run a script of the repository as a person does."""
-    return subprocess.run(
-        [sys.executable, str(ROOT / script), *words],
-        cwd=cwd,
-        env={**os.environ, **env},
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    options = {"capture_output": True, "text": True, "timeout": 600, "check": False}
+    line = [sys.executable, str(ROOT / script), *words]
+    return subprocess.run(line, cwd=cwd, env={**os.environ, **env}, **options)
 
 
 def printed(script, *words, cwd, **env):

@@ -125,7 +125,7 @@ def white_noise(generator, samples, components):
 
 def network(generator, *sizes):
     """A tanh network in float64; the last layer is linear."""
-    layers: list[nn.Module] = []
+    layers = []
     for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
         layers += [nn.Linear(inputs, outputs, dtype=torch.float64), nn.Tanh()]
         for p in layers[2 * i].parameters():

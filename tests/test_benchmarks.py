@@ -41,7 +41,7 @@ def test_the_calibration_example_runs(tmp_path):
 
 
 def test_candidates_are_timed_once_a_round_in_turns_after_a_warm_up():
-    calls: list[str] = []
+    calls = []
     args = argparse.Namespace(clock="wall", threads=1, rounds=3, quick=True)
     candidates = {name: lambda name=name: calls.append(name) for name in "abc"}
     seconds = interleaved.measure(candidates, args)

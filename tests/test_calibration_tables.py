@@ -23,7 +23,7 @@ def steps_with(observed, **more):
     classes = torch.zeros(observed.shape, dtype=torch.int64)
     for e, i in itertools.product(range(episodes), range(obs)):
         seen = observed[e, :, i].tolist()
-        latest: int | None = None
+        latest = None
         for t in range(time):
             if latest is None:
                 classes[e, t, i] = len(BINS)
@@ -31,14 +31,9 @@ def steps_with(observed, **more):
                 classes[e, t, i] = max(k for k, b in enumerate(BINS) if b <= t - latest)
             latest = t if seen[t] else latest
     zeros = torch.zeros(observed.shape, dtype=torch.float64)
-    names = ("reading", "truth", "last value", "running mean")
-    return {
-        "observed": observed,
-        "running": torch.ones_like(observed),
-        "class": classes,
-        **dict.fromkeys(names, zeros),
-        **more,
-    }
+    steps = dict.fromkeys(("reading", "truth", "last value", "running mean"), zeros)
+    steps |= {"observed": observed, "running": torch.ones_like(observed), "class": classes}
+    return steps | more
 
 
 def test_errors_are_sorted_by_arrival_and_by_steps_since_last_seen():
@@ -66,14 +61,10 @@ def known_forecasts(std):
     root = torch.tensor([[1.0, 0, 0], [0.6, 0.8, 0], [0, 0.6, 0.8]], dtype=torch.float64)
     reading = torch.randn(shape, generator=g, dtype=torch.float64) @ root.T
     cov = std**2 * (root @ root.T).expand(*shape[:2], 3, 3)
-    steps = steps_with(observed) | {
-        "reading": torch.where(observed, reading, torch.nan),
-        "truth": reading,
-        "predicted": torch.zeros(shape, dtype=torch.float64),
-        "predicted cov": cov,
-        "filtered": torch.zeros(shape, dtype=torch.float64),
-        "filtered variance": cov.diagonal(dim1=-2, dim2=-1),
-    }
+    steps = steps_with(observed, truth=reading, reading=torch.where(observed, reading, torch.nan))
+    zeros = torch.zeros(shape, dtype=torch.float64)
+    steps |= {"predicted": zeros, "predicted cov": cov, "filtered": zeros}
+    steps["filtered variance"] = cov.diagonal(dim1=-2, dim2=-1)
     total = observed.sum((1, 2)).double()
     tally = Tally(class_names(BINS), torch.full((40,), 100.0), total, 3)
     for start in range(0, 100, 30):  # chunks of different length

@@ -5,7 +5,6 @@ import importlib
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -24,7 +23,7 @@ SHORT = [
     "trainer.total_frames=256", "trainer.num_epochs=1", "collector.total_frames=256",
     "collector.frames_per_batch=128", "storage.max_size=128", "buffer.batch_size=64",
 ]  # fmt: skip
-REQUIRED: dict[str, dict[str, Any]] = {
+REQUIRED = {
     "observation_delay": {"delay": 1},
     "observation_multi_rate": {"period": [1, 2]},
     "observation_missingness": {"mechanism": "mcar", "eta": 0.5},

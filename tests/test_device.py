@@ -3,8 +3,6 @@
 "meta" stands for a device that isn't the CPU: it refuses to be mixed with it, as a GPU does.
 """
 
-from typing import Any
-
 import pytest
 import torch
 from ppo_drbpn import assemble
@@ -38,7 +36,7 @@ def test_a_gpu_that_is_not_here_ends_a_run_in_one_line_that_leaves_no_folder(tmp
 
 def test_the_collector_leaves_simulators_where_they_are(monkeypatch):
     training, _ = assembled(*SMOKE)
-    made: list[dict[str, Any]] = []
+    made = []
     monkeypatch.setattr(envs, "Collector", lambda *args, **kwargs: made.append(kwargs))
     for device in ("cpu", "meta"):
         policy = training.agent.policy.to(device)

@@ -6,7 +6,6 @@ import re
 import shutil
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 from recipe_tools import ROOT, printed
@@ -29,7 +28,7 @@ CITATION = re.compile(r"\b[Ee]qs?\.\s+((?:\(?\d+\)?(?:,\s+|\s+and\s+)?)+)\s+\[DR
 
 def tables(page):
     """The tables of a page, each as its rows of cells without the rule."""
-    rows: list[list[str]] = []
+    rows = []
     for line in [*page.read_text(encoding="utf-8").splitlines(), ""]:
         if line.startswith("|"):
             rows.append([cell.strip() for cell in line.strip("|").split("|")])
@@ -54,7 +53,7 @@ def equation_rows():
 
 def resolve(name):
     """The object called `torchrl_drbpn.<name>`."""
-    value: Any = importlib.import_module(PACKAGE.name)
+    value = importlib.import_module(PACKAGE.name)
     path = PACKAGE.name
     for part in name.split("."):
         path += f".{part}"

@@ -7,7 +7,6 @@ import pytest
 import small_agents
 import torch
 from small_agents import ACTION, ENVS, OBS, TIME, collect, make_agent, make_filter
-from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import SliceSampler, SliceSamplerWithoutReplacement
@@ -59,7 +58,7 @@ def test_it_trains_inside_ppotrainer(own_gae):
     buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=8 * SLICE)
     if own_gae:
         loss.make_value_estimator(gamma=0.9, lmbda=0.8)
-    seen: list[TensorDictBase] = []
+    seen = []
     trainer = PPOTrainer(
         collector=collector, total_frames=4 * FRAMES, frame_skip=1, optim_steps_per_batch=1,
         loss_module=loss, optimizer=torch.optim.Adam(loss.parameters(), lr=3e-3), num_epochs=2,
@@ -137,9 +136,9 @@ def test_an_epoch_of_the_guides_trainer_takes_every_step_once_from_a_ratio_of_on
     trainer = guide.make_trainer()
     assert trainer.num_epochs == guide.EPOCHS
     trainer.num_epochs = 2
-    epochs: list[list[torch.Tensor]] = []
+    epochs = []
     losses = trainer.loss_module.forward
-    out: list[TensorDictBase] = []
+    out = []
     monkeypatch.setattr(
         trainer.loss_module, "forward", lambda batch: out.append(losses(batch)) or out[-1]
     )

@@ -4,7 +4,6 @@ import dataclasses
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import evaluate as recipe
 import numpy as np
@@ -28,7 +27,7 @@ def test_more_episodes_only_add(trained_run, tmp_path, monkeypatch):
     monkeypatch.setattr("evaluation.trained.BLOCK", 3)
     folder = trained_run("dvrl")
     points = "'mar:0.5','outages:0.5:3','spikes:0.2','reduction:0.5:random'"
-    how: dict[str, Any] = {"points": points, "modes": ["sampled"]}
+    how = {"points": points, "modes": ["sampled"]}
     many = evaluate(tmp_path / "many.csv", folder, episodes=7, **how)
     for count in (2, 4):
         few = evaluate(tmp_path / f"{count}.csv", folder, episodes=count, **how)

@@ -1,7 +1,6 @@
 """Fitting the filter to logged data: what is read, what is learned, what an agent starts from."""
 
 from pathlib import Path
-from typing import Any
 
 import fit as recipe
 import numpy as np
@@ -13,6 +12,7 @@ import torch
 from estimation import fitting
 from estimation.fitting import Sequences, fit, hide, per_entry, run, split
 from estimation.logs import read_log
+from evaluation.trained import load_trained_agent
 from evaluation_tools import configured
 from filter_problems import space
 from recipe_tools import assembled, refused
@@ -182,7 +182,7 @@ def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(
     data = sequences(oracles.random_system(3, 4), 2, 12)
     torch.manual_seed(0)
     belief_filter = BeliefFilter(4, 2, 3, covariance="propagated")
-    calls: list[tuple[Any, ...]] = []
+    calls = []
 
     def watched(own, given, before=None):
         jacobian = own.mean_jacobian.clone()
@@ -286,8 +286,6 @@ def test_an_agent_starts_from_the_filter_and_its_normalisation(fitted, tmp_path)
         "evaluation.final_episodes=0",
     ) == 0  # fmt: skip
     path.unlink()  # a run needs it once
-    from evaluation.trained import load_trained_agent
-
     assert load_trained_agent(tmp_path / "run").frames == 128
     assert recipe_tools.resume(tmp_path / "run", "total_frames=256") == 0
     with refused("does not fit the settings of this run"):

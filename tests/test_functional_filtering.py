@@ -17,11 +17,8 @@ covariances = pytest.mark.parametrize(
 
 @pytest.mark.parametrize(
     "events",
-    [
-        pytest.param({"resets": False}, id="one episode"),
-        pytest.param({"resets": True}, id="resets"),
-        pytest.param({"resets": True, "stored": True}, id="resets and stored states"),
-    ],
+    [{"resets": False}, {"resets": True}, {"resets": True, "stored": True}],
+    ids=["one episode", "resets", "resets and stored states"],
 )
 @pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
 @covariances

@@ -93,13 +93,10 @@ def test_what_it_does_not_take_it_names():
     assert reason(Problem(2, 65, full_noise=True).model()) == "obs is 65, more than 64"
     assert reason(Problem(2, 65).model()) is None  # 2 x 2 is factorised
     assert reason(Problem(65, 66).model()) == "state is 65, more than 64"
-    half = StateSpace(
-        model.transition._replace(**{
-            name: tuple(x.half() for x in getattr(model.transition, name))
-            for name in ("weights", "biases")
-        }),
-        *(getattr(model, name).half() for name in list(vars(model))[1:8]),
-    )  # fmt: skip
+    f, fields = model.transition, list(vars(model))[1:8]
+    weights, biases = (tuple(x.half() for x in part) for part in (f.weights, f.biases))
+    f = f._replace(weights=weights, biases=biases)
+    half = StateSpace(f, *(getattr(model, name).half() for name in fields))
     assert reason(half) == "there is none for torch.float16"
 
     class Own(torch.Tensor):

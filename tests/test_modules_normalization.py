@@ -36,16 +36,10 @@ def make_rollout(seed=0, batch=(4,), time=25, missing=0.3):
     # Between ends of episodes the next reading is that of the next step.
     ends = done.clone()
     ends[..., -1, :] = True
-    following = TensorDict(
-        observation=last.where(ends, x.roll(-1, -2)),
-        observed=last_seen.where(ends, seen.roll(-1, -2)),
-        done=done,
-        batch_size=(*batch, time),
-    )
-    return TensorDict(
-        {"observation": x, "observed": seen, "is_init": is_init, "next": following},
-        batch_size=(*batch, time),
-    )
+    following = {"observation": last.where(ends, x.roll(-1, -2)), "done": done}
+    following["observed"] = last_seen.where(ends, seen.roll(-1, -2))
+    data = {"observation": x, "observed": seen, "is_init": is_init, "next": following}
+    return TensorDict(data, (*batch, time))
 
 
 def received(rollout, component):

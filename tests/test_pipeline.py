@@ -20,12 +20,9 @@ DTYPE, HIDDEN = torch.float32, 6
 
 
 def gru(**kwargs):
-    return GRUModule(
-        input_size=OBS,
-        hidden_size=HIDDEN,
-        in_keys=["observation", "recurrent_state", "is_init"],
-        out_keys=["features", ("next", "recurrent_state")],
-    )
+    out_keys = ["features", ("next", "recurrent_state")]
+    keys = {"in_keys": ["observation", "recurrent_state", "is_init"], "out_keys": out_keys}
+    return GRUModule(input_size=OBS, hidden_size=HIDDEN, **keys)
 
 
 def belief_filter(**kwargs):

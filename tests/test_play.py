@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -254,7 +253,7 @@ def test_an_mp4_without_its_package_is_refused_before_anything_is_done(
 
 
 def test_the_camera_follows_the_robot():
-    walker: Any = gymnasium.make("Walker2d-v5").unwrapped
+    walker = gymnasium.make("Walker2d-v5").unwrapped
     walker.reset(seed=0)
     camera = Camera("Walker2d-v5", (96, 128))
 

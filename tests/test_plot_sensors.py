@@ -65,19 +65,12 @@ def test_the_observation_covariance_is_that_of_a_step_inside_an_episode(agents, 
     module = BeliefFilterModule(
         agents[0].agent.belief.filter, out_keys=[("belief", "innovation_cov")]
     )
-    data = TensorDict(
-        {
-            "observation": torch.zeros(1, OBS),
-            "observed": torch.rand(1, OBS, generator=torch.Generator().manual_seed(0)) < 0.5,
-            "previous_action": torch.ones(1, ACTION),
-            "is_init": torch.zeros(1, 1, dtype=torch.bool),
-            ("recurrent", "mean"): torch.ones(1, OBS),
-            ("recurrent", "age"): torch.ones(1, 1, dtype=torch.int64),
-        },
-        [1],
-    )
+    seen = torch.rand(1, OBS, generator=torch.Generator().manual_seed(0)) < 0.5
+    data = {"observation": torch.zeros(1, OBS), "observed": seen}
+    data |= {"previous_action": torch.ones(1, ACTION), "is_init": torch.zeros(1, 1).bool()}
+    data["recurrent"] = {"mean": torch.ones(1, OBS), "age": torch.ones(1, 1).long()}
     with torch.no_grad():
-        said = module(data)["belief", "innovation_cov"][0]
+        said = module(TensorDict(data, [1]))["belief", "innovation_cov"][0]
     torch.testing.assert_close(said.double(), models[0].observation_cov, rtol=1e-4, atol=1e-7)
 
 

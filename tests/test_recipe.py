@@ -15,6 +15,7 @@ from ppo_drbpn import train_rollout
 from recipe_tools import SMOKE, assembled, assert_same_run, differences, read_table, refused, run
 from tqdm import tqdm
 from training.checkpoint import last_checkpoint
+from training.config import new_folder
 from training.console import BAR, show
 from training.run_folder import read_config
 
@@ -146,8 +147,6 @@ def test_what_is_wrong_is_one_line_with_status_2_and_leaves_no_folder(tmp_path, 
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
-    from training.config import new_folder
-
     monkeypatch.chdir(tmp_path)
     names = [new_folder("Hopper-v5-drbpn-seed0") for _ in range(3)]
     assert len(set(names)) == 3
@@ -170,12 +169,9 @@ def test_the_progress_bar_has_room_on_100_columns():
 @pytest.mark.slow
 def test_a_closed_pipe_does_not_stop_a_run(tmp_path):
     words = [*SMOKE, "total_frames=256", "hydra.run.dir=run", "evaluation.every_frames=0"]
-    job = subprocess.Popen(
-        [sys.executable, str(recipe_tools.ROOT / "recipes" / "ppo_drbpn.py"), *words],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-    )
+    line = [sys.executable, str(recipe_tools.ROOT / "recipes" / "ppo_drbpn.py"), *words]
+    pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
+    job = subprocess.Popen(line, cwd=tmp_path, stdout=pipe, stderr=nowhere)
     assert job.stdout is not None
     job.stdout.close()
     assert job.wait(timeout=240) == 0

@@ -7,9 +7,11 @@ filling keeps the last value.
 import functools
 
 import pytest
+import recipe_tools
 import torch
 from contracts import ACTION, OBS, RecipeBeliefContract, saved
-from ppo_drbpn import collect, train_rollout
+from evaluation.trained import load_trained_agent
+from ppo_drbpn import train_rollout
 from recipe_tools import BELIEFS, assembled, differences, make_config, read_table, refused, run
 from torchrl.modules import set_recurrent_mode
 from training.config import build
@@ -127,10 +129,7 @@ def rollout(belief):
     """Return a training and its second rollout: rows begin in mid-episode, and episodes end."""
     with torch.random.fork_rng():
         gaps = ("missingness=mcar", "missingness.eta=0.5")
-        training, _ = assembled(*SMOKE, f"belief={belief}", *gaps)
-        training.agent.norm.update(collect(training))
-        collect(training)
-        data = collect(training).clone()
+        training, data = recipe_tools.second_rollout(*SMOKE, f"belief={belief}", *gaps)
     assert data["next", "done"][:, :-1].any()
     return training, data
 
@@ -208,8 +207,6 @@ def test_the_values_of_the_advantages_are_those_of_the_complete_observations(bel
 
 
 def test_the_trained_agent_acts_where_nothing_complete_is_written(tmp_path):
-    from evaluation.trained import load_trained_agent
-
     assert run(tmp_path / "run", *SMOKE, "total_frames=128") == 0
     trained = load_trained_agent(tmp_path / "run")
     env = trained.environments()(0)

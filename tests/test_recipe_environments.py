@@ -90,13 +90,7 @@ def test_the_mask_that_an_environment_writes_says_what_arrived(eta):
     assert row["missing_ratio"] > 0.4
 
 
-ENVPOOL = (
-    "experiment=smoke",
-    "env.backend=envpool",
-    "missingness=mcar",
-    "missingness.eta=0.2",
-    "evaluation.every_frames=0",
-)
+ENVPOOL = (*SMOKE, "env.backend=envpool", "evaluation.every_frames=0")
 LINE = "InvertedPendulum-v5 can't save its state here: going on with new episodes"
 
 

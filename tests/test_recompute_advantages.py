@@ -1,23 +1,19 @@
 """What the epochs of an update are cut from; optim.recompute_advantages."""
 
 import pytest
-import recipe_tools  # noqa: F401 (the recipes become importable)
 import torch
-from recipe_tools import assembled
+from ppo_drbpn import train_rollout
+from recipe_tools import assembled, second_rollout
+from torchrl.objectives.value import GAE
+from training.ppo import add_advantages
 from training.reward_scale import ReturnStatistics, scale_reward
 
 SMOKE = ("experiment=smoke", "missingness=mcar", "missingness.eta=0.5")
 
 
 def collected(*overrides):
-    from ppo_drbpn import collect
-    from training.ppo import add_advantages
-
     with torch.random.fork_rng():
-        training, _ = assembled(*SMOKE, *overrides)
-        training.agent.norm.update(collect(training))
-        collect(training)
-        data = collect(training).clone()
+        training, data = second_rollout(*SMOKE, *overrides)
     add_advantages(data, training.agent, training.gae)
     return training, data
 
@@ -31,8 +27,6 @@ def move_critic(training):
 # A particle filter draws anew at every pass: its beliefs are not repeated by a second step.
 @pytest.mark.parametrize("belief", ["drbpn", "gru", "transformer", "fill"])
 def test_the_parameters_that_collected_give_the_advantages_that_were_there(belief):
-    from training.ppo import add_advantages
-
     training, data = collected(f"belief={belief}")
     before = data["advantage"].clone()
     with torch.random.fork_rng():
@@ -41,9 +35,6 @@ def test_the_parameters_that_collected_give_the_advantages_that_were_there(belie
 
 
 def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
-    from torchrl.objectives.value import GAE
-    from training.ppo import add_advantages
-
     training, data = collected("belief=none")
     stale = data["advantage"].clone()
     move_critic(training)
@@ -59,8 +50,6 @@ def test_without_memory_it_is_gae_with_the_network_as_it_is_now():
 
 
 def losses(recompute, epochs):
-    from ppo_drbpn import train_rollout
-
     with torch.random.fork_rng():
         flag = f"optim.recompute_advantages={str(recompute).lower()}"
         training, config = assembled(*SMOKE, flag, f"optim.epochs={epochs}", "optim.lr=0.01")

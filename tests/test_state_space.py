@@ -17,10 +17,8 @@ COVS = list(itertools.product(("diag", "full"), (False, True)))
 
 def inputs(batch=(7,), seed=0):
     g = torch.Generator().manual_seed(seed)
-    return (
-        torch.randn(*batch, STATE, generator=g, dtype=F64),
-        torch.randn(*batch, ACTION, generator=g, dtype=F64),
-    )
+    randn = functools.partial(torch.randn, *batch, generator=g, dtype=F64)
+    return randn(STATE), randn(ACTION)
 
 
 def scramble(module, scale, seed=0):

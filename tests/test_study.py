@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import hydra
 import pytest
@@ -167,12 +166,8 @@ def test_whatever_ends_a_cell_is_one_line_and_a_stop_of_the_sweep_starts_no_othe
 
 
 def sweep(folder, rates, launcher="basic"):
-    words = (
-        f"optim.lr={rates}",
-        "belief=none",
-        "hydra.sweep.dir=out",
-        f"hydra/launcher={launcher}",
-    )
+    place = ("belief=none", "hydra.sweep.dir=out", f"hydra/launcher={launcher}")
+    words = (*place, f"optim.lr={rates}")
     return command("recipes/ppo_drbpn.py", "--multirun", *BRIEF, *words, cwd=folder)
 
 
@@ -228,17 +223,12 @@ def test_slurm_gets_one_array_with_a_task_for_each_cell(tmp_path):
 @pytest.fixture
 def start(tmp_path):
     """Start a sweep in a process group of its own; nothing of it is left at the end."""
-    line = [
-        sys.executable,
-        str(recipe_tools.ROOT / "recipes" / "ppo_drbpn.py"),
-        "-m",
-        "study=smoke",
-        *LONG,
-    ]
-    started: list[subprocess.Popen[str]] = []
+    script = str(recipe_tools.ROOT / "recipes" / "ppo_drbpn.py")
+    line = [sys.executable, script, "-m", "study=smoke", *LONG]
+    started = []
 
     def begin(*words):
-        options: Any = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+        options = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
         started.append(subprocess.Popen([*line, *words], cwd=tmp_path, **options))
         return started[-1]
 

@@ -3,16 +3,17 @@
 import pytest
 import torch
 from belief_frames import BeliefFrames
+from beliefs.transformer import MemoryAttention
 from contract_environments import ACTION, OBS
 from torch import nn
 from torchrl.modules import set_recurrent_mode
+from training.config import build, choice
+from training.errors import UserError
 
 MEMORY, LENGTH = ("recurrent", "memory"), ("recurrent", "length")
 
 
 def make_module(**sizes):
-    from training.config import build, choice
-
     sizes = {"window": 4, "width": 16, "layers": 1, **sizes}
     settings = choice("belief", "transformer", **sizes)
     with torch.random.fork_rng():
@@ -57,8 +58,6 @@ def band(time, steps):
 
 
 def test_attention_is_that_of_torch_with_positions_added_to_the_keys():
-    from beliefs.transformer import MemoryAttention
-
     rows, time, window, width, heads = 3, 4, 5, 12, 3
     entries = window - 1 + time
     torch.manual_seed(0)
@@ -170,7 +169,5 @@ def test_no_gradient_flows_into_the_memory():
     "sizes", [{"window": 0}, {"layers": 0}, {"heads": 0}, {"width": 0}, {"heads": 3}]
 )
 def test_sizes_that_do_not_fit_are_named(sizes):
-    from training.errors import UserError
-
     with pytest.raises(UserError, match="`belief`: `window`, `width`, `layers` and"):
         make_module(**sizes)

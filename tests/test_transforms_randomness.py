@@ -31,13 +31,9 @@ RANDOM = ["nmar", "noise", "spikes", "outages", "delay", "multi_rate"]
 
 
 def corrupted_gym(**kwargs):
-    return gym_env().append_transform(
-        Compose(
-            ObservationNoise(0.1, complete_key=COMPLETE),
-            ObservationMissingness("mcar", 0.5),
-            SensorOutages(0.3, 3, **kwargs),
-        )
-    )
+    noise = ObservationNoise(0.1, complete_key=COMPLETE)
+    chain = Compose(noise, ObservationMissingness("mcar", 0.5), SensorOutages(0.3, 3, **kwargs))
+    return gym_env().append_transform(chain)
 
 
 def zero_policy(tensordict):

@@ -16,8 +16,6 @@ again, and let go on to its end. It then equals the run that nobody stopped, to 
 tables and its last checkpoint. What can't go on says so in one line and leaves what was there.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import os
@@ -115,7 +113,7 @@ def progress(text):
 
 def kills(work, draw, count):
     """Kill runs of every belief and algorithm at random moments."""
-    wrong, stages, cases = [], Counter[str](), list(CASES.items())[: max(2, count // 6)]
+    wrong, stages, cases = [], Counter(), list(CASES.items())[: max(2, count // 6)]
     for number, (name, words) in enumerate(cases):
         straight, killed = work / f"straight-{number}", work / f"killed-{number}"
         seconds = finished(straight, words)
@@ -220,7 +218,7 @@ def flipped_bits(work, draw, count):
     path = last_checkpoint(folder)
     sums, whole = path.with_name(path.name + ".sha256"), path.read_bytes()
     kept, wrong = sums.read_text(), []
-    loaded = Counter[bool]()
+    loaded = Counter()
     for with_sum in (True, False):
         sums.write_text(kept) if with_sum else sums.unlink()
         for _ in range(count):
