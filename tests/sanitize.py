@@ -36,14 +36,9 @@ def main():
             subprocess.check_output([compiler, f"-print-file-name={name}"], text=True).strip()
             for name in ("libasan.so", "libubsan.so")
         ]
-        environment = {
-            **os.environ,
-            "LD_PRELOAD": ":".join(runtimes),
-            "ASAN_OPTIONS": "detect_leaks=0",
-            "PYTHONPATH": f"{copy}:{copy / 'tests'}",
-            "ATEN_CPU_CAPABILITY": "default",  # the baseline library is the one that is there
-            "OMP_NUM_THREADS": "1",
-        }
+        environment = os.environ | {"LD_PRELOAD": ":".join(runtimes), "OMP_NUM_THREADS": "1"}
+        environment |= {"ASAN_OPTIONS": "detect_leaks=0", "PYTHONPATH": f"{copy}:{copy / 'tests'}"}
+        environment["ATEN_CPU_CAPABILITY"] = "default"  # the library that is there
         tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(copy)]
         tests.append(str(copy / "tests" / "test_functional_native.py"))
         worst = 0

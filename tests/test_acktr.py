@@ -1,5 +1,6 @@
 """ACKTR behind the recipe's one path; its steps are held to Fisher matrices in float64."""
 
+import functools
 import itertools
 import shutil
 
@@ -9,6 +10,7 @@ from algorithms.acktr import ACKTR
 from algorithms.kfac import KFAC, kronecker_factors, solve_kronecker
 from ppo_drbpn import collect, train_rollout
 from recipe_tools import assembled, assert_same_run, read_table, resume, run
+from refusals import refuses
 from torch import nn
 from training.checkpoint import last_checkpoint, load_checkpoint
 from training.ppo import add_advantages
@@ -257,14 +259,9 @@ def test_a_step_before_any_curvature_is_refused(generator):
         KFAC(layer, **NUMBERS).step()
 
 
-@pytest.mark.parametrize(
-    ("module", "line"),
-    [
-        (nn.Sequential(nn.Linear(2, 2), nn.LayerNorm(2)), "got 1.weight, 1.bias"),
-        (nn.Linear(2, 2, bias=False), "got a layer without bias"),
-    ],
-    ids=["layer-norm", "no-bias"],
+LINEAR = "`module` must hold linear layers.*got"
+test_other_layers_are_refused_by_name = refuses(
+    ({"module": nn.Sequential(nn.Linear(2, 2), nn.LayerNorm(2))}, f"{LINEAR} 1.weight, 1.bias"),
+    ({"module": nn.Linear(2, 2, bias=False)}, f"{LINEAR} a layer without bias"),
+    make=functools.partial(KFAC, **NUMBERS),
 )
-def test_other_layers_are_refused_by_name(module, line):
-    with pytest.raises(ValueError, match=f"`module` must hold linear layers.*{line}"):
-        KFAC(module, **NUMBERS)

@@ -44,16 +44,15 @@ def test_a_constant_covariance_is_too_small_in_outages_though_its_average_nis_is
     exact_cov = model.transition_cov
     assert isinstance(exact_cov, torch.Tensor)
     data = constant_covariance.simulate(model, case, 60, 80, seed=1)
+    judged = {
+        "constant": constant_covariance.judge(model, cov, *data, propagated=False),
+        "exact": constant_covariance.judge(model, exact_cov, *data, propagated=True),
+        "mistaken": constant_covariance.judge(model, cov, *data, propagated=True),
+    }
+    scores = {"nees": "entries", "nis": "dof", "se": "entries"}
     found = {
-        name: {
-            key: (sums[key].sum() / sums[per].sum()).item()
-            for key, per in (("nees", "entries"), ("nis", "dof"), ("se", "entries"))
-        }
-        for name, sums in (
-            ("constant", constant_covariance.judge(model, cov, *data, propagated=False)),
-            ("exact", constant_covariance.judge(model, exact_cov, *data, propagated=True)),
-            ("mistaken", constant_covariance.judge(model, cov, *data, propagated=True)),
-        )
+        name: {key: (sums[key].sum() / sums[per].sum()).item() for key, per in scores.items()}
+        for name, sums in judged.items()
     }
     assert found["exact"]["nees"] == pytest.approx(1, abs=0.1)
     assert found["constant"]["nees"] > 1.4

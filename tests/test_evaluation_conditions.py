@@ -17,29 +17,19 @@ def settings(agent):
     return agent.settings
 
 
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("trained", "mcar:0.4"),
-        ("none:0", "none:0"),
-        ("nmar:.5", "nmar:0.5"),
-        ("outages:0.5:20", "outages:0.5:20:sensor"),
-        ("outages:0.2:5:kind", "outages:0.2:5:kind"),
-        ("reduction:0.4:model", "reduction:0.4:model"),
-        ("noise:2", "noise:2"),
-        ("spikes:0.05", "spikes:0.05:5"),
-        ("spikes:0.05:2", "spikes:0.05:2"),
-        ("stuck:.05", "stuck:0.05:20:sensor"),
-        ("stuck:0.05:5:joint", "stuck:0.05:5:joint"),
-        ("drift:0.02", "drift:0.02:0"),
-        ("drift:0:-0.1", "drift:0:-0.1"),
-        ("delay:2", "delay:2"),
-        ("delay:0:3", "delay:0:3:sensor"),
-        ("delay:1:3:kind:in_order", "delay:1:3:kind:in_order"),
-        ("multi_rate:4", "multi_rate:4:sensor"),
-        ("multi_rate:4:joint:0", "multi_rate:4:joint:0"),
-    ],
+NAMES = (
+    "trained -> mcar:0.4, none:0 -> none:0, nmar:.5 -> nmar:0.5, "
+    "outages:0.5:20 -> outages:0.5:20:sensor, outages:0.2:5:kind -> outages:0.2:5:kind, "
+    "reduction:0.4:model -> reduction:0.4:model, noise:2 -> noise:2, "
+    "spikes:0.05 -> spikes:0.05:5, spikes:0.05:2 -> spikes:0.05:2, "
+    "stuck:.05 -> stuck:0.05:20:sensor, stuck:0.05:5:joint -> stuck:0.05:5:joint, "
+    "drift:0.02 -> drift:0.02:0, drift:0:-0.1 -> drift:0:-0.1, delay:2 -> delay:2, "
+    "delay:0:3 -> delay:0:3:sensor, delay:1:3:kind:in_order -> delay:1:3:kind:in_order, "
+    "multi_rate:4 -> multi_rate:4:sensor, multi_rate:4:joint:0 -> multi_rate:4:joint:0"
 )
+
+
+@pytest.mark.parametrize(("text", "name"), [pair.split(" -> ") for pair in NAMES.split(", ")])
 def test_the_full_name_of_a_condition_reads_back_to_it(text, name, settings):
     condition = parse(text, settings)
     assert condition.name == name

@@ -126,19 +126,18 @@ def test_a_wrong_tensor_never_reaches_c(place, spoil):
         operator(*arguments)
 
 
-@pytest.mark.parametrize("place", [4, 5, 7, 8])
-def test_a_belief_that_is_not_whole_never_reaches_c(place):
-    arguments = Problem(3, 5, stored=True, propagated=True).operator_arguments()
-    arguments[place] = None
-    with pytest.raises(ValueError, match=r"beside `stored`|come with `cov`"):
-        operator(*arguments)
+WHOLE = r"beside `stored`|come with `cov`"
+WIDTH = r"must be|last width|no size"
+WIDTHS = ([], [5], [5, 4], [3], [0, 3], [-5, 3], [5, 3, 3])
+PARTS = [*((i, None, WHOLE) for i in (4, 5, 7, 8)), *((18, w, WIDTH) for w in WIDTHS)]
 
 
-@pytest.mark.parametrize("widths", [[], [5], [5, 4], [3], [0, 3], [-5, 3], [5, 3, 3]], ids=str)
-def test_widths_that_are_not_the_networks_never_reach_c(widths):
-    arguments = Problem(3, 5).operator_arguments()
-    arguments[18] = widths
-    with pytest.raises(ValueError, match=r"must be|last width|no size"):
+@pytest.mark.parametrize(("place", "value", "line"), PARTS, ids=str)
+def test_half_a_belief_and_widths_that_are_not_the_networks_never_reach_c(place, value, line):
+    belief = {"stored": True, "propagated": True} if value is None else {}
+    arguments = Problem(3, 5, **belief).operator_arguments()
+    arguments[place] = value
+    with pytest.raises(ValueError, match=line):
         operator(*arguments)
 
 

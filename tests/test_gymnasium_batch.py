@@ -83,16 +83,9 @@ def test_trajectories_are_those_of_gymnasium_to_the_last_bit(env_id):
 
 @pytest.mark.parametrize(
     ("own", "registered", "asked", "expected"),
-    [
-        (4, None, None, 4),
-        (4, 7, None, 4),
-        (7, 4, None, 4),
-        (7, None, 5, 5),
-        (4, 7, -1, 4),
-        (None, 6, None, 6),
-        (None, 6, -1, None),
-    ],
-)
+    [(4, None, None, 4), (4, 7, None, 4), (7, 4, None, 4), (7, None, 5, 5), (4, 7, -1, 4),
+     (None, 6, None, 6), (None, 6, -1, None)],
+)  # fmt: skip
 def test_the_shortest_time_limit_counts_as_in_gymnasium(register, own, registered, asked, expected):
     def make():
         env = Counter()

@@ -121,15 +121,14 @@ def test_a_fixed_matrix_is_saved_but_not_learned():
     assert torch.equal(emission.matrix, torch.eye(OBS, 7))
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        GaussianTransition(STATE, ACTION, cov="full", cov_network=True),
-        GaussianTransition(STATE, ACTION),
-        LinearGaussianEmission(OBS, STATE, ACTION, cov="full"),
-    ],
-    ids=["network Q", "free Q", "emission"],
-)
+MODULES = {
+    "network Q": GaussianTransition(STATE, ACTION, cov="full", cov_network=True),
+    "free Q": GaussianTransition(STATE, ACTION),
+    "emission": LinearGaussianEmission(OBS, STATE, ACTION, cov="full"),
+}
+
+
+@pytest.mark.parametrize("module", MODULES.values(), ids=MODULES)
 def test_reset_parameters_go_back_to_the_start(module):
     def noise():
         if isinstance(module, LinearGaussianEmission):

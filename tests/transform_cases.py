@@ -10,20 +10,7 @@ from contracts import ACTION, OBS
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, Transform, TransformedEnv
 
-from torchrl_drbpn.transforms import (
-    FillLastObserved,
-    ObservationDelay,
-    ObservationMissingness,
-    ObservationMultiRate,
-    ObservationNoise,
-    ObservationSpikes,
-    ObservedFromNaN,
-    PreviousAction,
-    SensorDrift,
-    SensorOutages,
-    SensorReduction,
-    StuckSensors,
-)
+from torchrl_drbpn import transforms as T
 
 COMPLETE = "complete_observation"
 Check = Callable[[TensorDictBase, TensorDictBase], None]
@@ -156,35 +143,36 @@ class Case:
         return TransformedEnv(base, Compose(*(make() for make in self.needs), self.make()))
 
 
-mcar = partial(ObservationMissingness, "mcar", 0.5, seed=0)
+mcar = partial(T.ObservationMissingness, "mcar", 0.5, seed=0)
 seeded = partial(partial, seed=0, complete_key=COMPLETE)  # of a class and its arguments
 ENDS = [[0, 1], [-1]]
 CASES = {
     "mcar": Case(partial(mcar, complete_key=COMPLETE), masked, keys=("observation", COMPLETE)),
-    "mar": Case(seeded(ObservationMissingness, "mar", 0.7), masked),
-    "nmar": Case(seeded(ObservationMissingness, "nmar", 0.7), masked),
+    "mar": Case(seeded(T.ObservationMissingness, "mar", 0.7), masked),
+    "nmar": Case(seeded(T.ObservationMissingness, "nmar", 0.7), masked),
     "reduction": Case(
-        partial(SensorReduction, [0, -1], complete_key=COMPLETE), reduced, offline=True
+        partial(T.SensorReduction, [0, -1], complete_key=COMPLETE), reduced, offline=True
     ),
-    "nan": Case(ObservedFromNaN, from_nan, offline=True, nan=True),
-    "noise": Case(seeded(ObservationNoise, 0.1), noisy, keys=("observation", COMPLETE)),
-    "spikes": Case(seeded(ObservationSpikes, 0.3, 50.0), spiked),
-    "outages": Case(seeded(SensorOutages, 0.5, 5), masked),
-    "groups": Case(seeded(SensorOutages, 0.4, 3, groups=ENDS, initial="on"), grouped),
+    "nan": Case(T.ObservedFromNaN, from_nan, offline=True, nan=True),
+    "noise": Case(seeded(T.ObservationNoise, 0.1), noisy, keys=("observation", COMPLETE)),
+    "spikes": Case(seeded(T.ObservationSpikes, 0.3, 50.0), spiked),
+    "outages": Case(seeded(T.SensorOutages, 0.5, 5), masked),
+    "groups": Case(seeded(T.SensorOutages, 0.4, 3, groups=ENDS, initial="on"), grouped),
     "delay": Case(
-        seeded(ObservationDelay, 0, max_delay=2, groups=ENDS),
+        seeded(T.ObservationDelay, 0, max_delay=2, groups=ENDS),
         delayed,
         keys=("observation", "delayed_observation"),
     ),
     "multi_rate": Case(
-        seeded(ObservationMultiRate, [1, 2, 3], phase="random", groups=[[0, 1], [2], [-1]]), masked
+        seeded(T.ObservationMultiRate, [1, 2, 3], phase="random", groups=[[0, 1], [2], [-1]]),
+        masked,
     ),
-    "stuck": Case(seeded(StuckSensors, 0.5, 3), stuck, keys=("observation", "stuck_observation")),
+    "stuck": Case(seeded(T.StuckSensors, 0.5, 3), stuck, keys=("observation", "stuck_observation")),
     "drift": Case(
-        seeded(SensorDrift, 0.1, 0.5, probability=0.5, groups=[[0], [-1]]),
+        seeded(T.SensorDrift, 0.1, 0.5, probability=0.5, groups=[[0], [-1]]),
         drifting,
         keys=("observation", "drift_bias"),
     ),
-    "fill": Case(FillLastObserved, filled, needs=[mcar]),
-    "previous_action": Case(PreviousAction, previous, keys=("previous_action",)),
+    "fill": Case(T.FillLastObserved, filled, needs=[mcar]),
+    "previous_action": Case(T.PreviousAction, previous, keys=("previous_action",)),
 }
