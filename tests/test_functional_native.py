@@ -55,15 +55,15 @@ def test_vmap_over_it_equals_a_loop(propagated):
     arguments = Problem(3, 5, propagated=propagated).operator_arguments()
     arguments = [x.detach() if isinstance(x, torch.Tensor) else x for x in arguments]
     observation = torch.stack([arguments[0], 2 * arguments[0]], -1)
-    networks = torch.stack([arguments[16], -arguments[16]])
+    networks = [torch.stack([x.detach(), -x.detach()]) for x in arguments[17]]
 
     def run(x, f):
-        mean, ll, _, cov = operator(x, *arguments[1:16], f, *arguments[17:])
+        mean, ll, _, cov = operator(x, *arguments[1:17], f, *arguments[18:])
         return mean, ll, cov
 
     found = torch.vmap(run, in_dims=(-1, 0))(observation, networks)
     for i in range(2):
-        expected = run(observation[..., i], networks[i])
+        expected = run(observation[..., i], [x[i] for x in networks])
         for a, b in zip(found, expected, strict=True):
             assert torch.equal(a[i], b)
 
@@ -110,16 +110,17 @@ def test_what_it_does_not_take_it_names():
     assert found == ["torch.func transforms PyTorch's operations"]
 
 
-@pytest.mark.parametrize("place", range(18))
+@pytest.mark.parametrize("place", range(19))
 @pytest.mark.parametrize("spoil", ["size", "dtype", "dimension", "device"])
 def test_a_wrong_tensor_never_reaches_c(place, spoil):
     arguments = Problem(3, 5, stored=True, propagated=True).operator_arguments()
-    x = arguments[place]
+    holder, at = (arguments, place) if place < 17 else (arguments[17], place - 17)
+    x = holder[at]
     spoilt = {
         "size": x[..., :-1], "dtype": x.to(torch.int32), "dimension": x.unsqueeze(0),
         "device": x.to("meta"),
     }  # fmt: skip
-    arguments[place] = spoilt[spoil]
+    holder[at] = spoilt[spoil]
     with pytest.raises(
         (ValueError, NotImplementedError, RuntimeError), match=r"must be|meta|device"
     ):
@@ -127,16 +128,17 @@ def test_a_wrong_tensor_never_reaches_c(place, spoil):
 
 
 WHOLE = r"beside `stored`|come with `cov`"
-WIDTH = r"must be|last width|no size"
-WIDTHS = ([], [5], [5, 4], [3], [0, 3], [-5, 3], [5, 3, 3])
-PARTS = [*((i, None, WHOLE) for i in (4, 5, 7, 8)), *((18, w, WIDTH) for w in WIDTHS)]
+LAYERS = r"must be|last width|no size"
+KEPT = ([], [0], [0, 1], [0, 1, 2], [1, 0, 2, 3], [0, 1, 2, 3, 2, 3])  # of weight, bias, ...
+PARTS = [*((i, None, WHOLE) for i in (4, 5, 7, 8)), *((17, kept, LAYERS) for kept in KEPT)]
 
 
-@pytest.mark.parametrize(("place", "value", "line"), PARTS, ids=str)
-def test_half_a_belief_and_widths_that_are_not_the_networks_never_reach_c(place, value, line):
-    belief = {"stored": True, "propagated": True} if value is None else {}
+@pytest.mark.parametrize(("place", "kept", "line"), PARTS, ids=str)
+@pytest.mark.parametrize("width", [slice(None), slice(0)], ids=["whole", "empty"])
+def test_half_a_belief_and_layers_that_are_no_network_never_reach_c(place, kept, line, width):
+    belief = {"stored": True, "propagated": True} if kept is None else {}
     arguments = Problem(3, 5, **belief).operator_arguments()
-    arguments[place] = value
+    arguments[place] = kept and [arguments[place][i][width] for i in kept]
     with pytest.raises(ValueError, match=line):
         operator(*arguments)
 

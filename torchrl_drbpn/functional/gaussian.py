@@ -36,7 +36,7 @@ def as_matrix(name: str, cov: Tensor, dim: int) -> Tensor:
     if cov.shape[-2:] == (dim, dim):
         return cov
     if cov.shape == (dim,):
-        return torch.diag_embed(cov)
+        return cov.diag()
     raise ValueError(
         f"`{name}` must be a covariance of shape (..., {dim}, {dim}) or the variances ({dim},) of "
         f"a diagonal one, got {tuple(cov.shape)}."

@@ -25,7 +25,7 @@ _KINDS = {torch.float32: "float", torch.float64: "double"}
 _WIDTHS = {"AVX512": "avx512", "AVX2": "avx2"}
 _MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
 _MAX_LAYERS = 15
-_TENSORS = 18  # arguments of the operator before the network's widths
+_TENSORS = 17  # arguments of the operator before the network's layers
 
 
 @functools.cache
@@ -114,25 +114,14 @@ def filter_rows(model: StateSpace, rows: FilterInputs) -> Filtered:
 
 
 def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
-    """Return a model as the operator takes it, the network's layers in one piece."""
+    """Return a model as the operator takes it, the network as weight, bias, weight, ..."""
     f = cast(TransitionMLP, model.transition)  # the rule saw to it
     layers = itertools.chain.from_iterable(zip(f.weights, f.biases, strict=True))
     return (
         model.constant_cov(), model.full_initial_cov(), model.emission_cov, model.emission_matrix,
-        model.action_matrix, model.emission_offset, model.initial_mean,
-        torch.cat([x.reshape(-1) for x in layers]), model.transition_jacobian,
-        [len(bias) for bias in f.biases], f.residual, f.activation == "tanh",
+        model.action_matrix, model.emission_offset, model.initial_mean, model.transition_jacobian,
+        list(layers), f.residual, f.activation == "tanh",
     )  # fmt: skip
-
-
-def _unpacked(
-    network: Tensor, Q: Tensor, B: Tensor, widths: list[int], residual: bool, tanh: bool
-) -> TransitionMLP:
-    """Return the network that :func:`operator_arguments` put into one piece."""
-    pairs = list(itertools.pairwise([len(Q) + B.shape[1], *widths]))
-    parts = torch.split(network, [size for m, n in pairs for size in (n * m, n)])
-    weights = tuple(part.view(n, m) for part, (m, n) in zip(parts[::2], pairs, strict=True))
-    return TransitionMLP(weights, tuple(parts[1::2]), residual, "tanh" if tanh else "relu")
 
 
 class _Call:
@@ -147,40 +136,41 @@ class _Call:
             )
         batch, time, obs = observation.shape
         state, actions = start.shape[1], action.shape[2]
-        self.widths = [state + actions, *layers]
+        widths = [state + actions, *(bias.numel() for bias in layers[1::2])]
         self.propagated = F is not None
         self.information = R.ndim == 1 and (obs > state or self.propagated)
         shapes: tuple[tuple[int, ...], ...] = (
             (batch, time, obs), (batch, time, obs), (batch, time, actions), (batch, time),
             (batch, time), (batch, time, state), (batch, state), (batch, time, state, state),
             (batch, state, state), (state, state), (state, state), (obs,) * min(2, max(1, R.ndim)),
-            (obs, state), (obs, actions), (obs,), (state,),
-            (sum(n * (m + 1) for m, n in itertools.pairwise(self.widths)),), (state, state),
+            (obs, state), (obs, actions), (obs,), (state,), (state, state),
+            *(shape for m, n in itertools.pairwise(widths) for shape in ((n, m), (n,))),
         )  # fmt: skip
         own = observation.dtype
-        for i, (x, shape) in enumerate(zip(arguments, shapes, strict=False)):
+        for i, (x, shape) in enumerate(zip((*arguments[:_TENSORS], *layers), shapes, strict=False)):
             dtype = torch.bool if i in (1, 3, 4) else own
             if x is not None and (x.shape != shape or x.dtype != dtype or x.device != start.device):
                 raise ValueError(
                     f"tensor {i} must be {dtype} of shape {shape} on {start.device}, got {x.dtype} "
                     f"{tuple(x.shape)} on {x.device}."
                 )
-        whole = bool(layers) and layers[-1] == state and (use_stored is None) == (stored is None)
+        whole = len(layers) == 2 * len(widths) - 2 and widths[-1] == state and bool(layers)
+        whole = whole and (use_stored is None) == (stored is None)
         if own not in _KINDS or not whole:
             raise ValueError("float32 or float64, last width state, `use_stored` beside `stored`.")
         needed = [cov is not None, stored_cov is not None or use_stored is None, R.ndim == 1]
         if self.propagated and not all(needed):
             raise ValueError("`F` must come with `cov`, `stored_cov` beside `stored`, R diagonal.")
         size = state if self.information else obs
-        smallest = min(*self.widths, *(n for shape in shapes for n in shape))
-        if size > _MAX_SIZE or len(layers) > _MAX_LAYERS or smallest < 1:
+        smallest = min(batch, time, obs, state, actions, *widths)
+        if size > _MAX_SIZE or len(widths) > _MAX_LAYERS + 1 or smallest < 1:
             raise ValueError(f"no size may be 0, none factorised over {_MAX_SIZE}; got {shapes}.")
         library = _library()
         if isinstance(library, str):
             raise RuntimeError(f"the native filter cannot run: {library}.")
         numbers = [
-            batch, time, obs, state, actions, len(layers), residual, not tanh, R.ndim == 2, state,
-            self.information, self.propagated, *layers,
+            batch, time, obs, state, actions, len(widths) - 1, residual, not tanh, R.ndim == 2,
+            state, self.information, self.propagated, *widths[1:],
         ]  # fmt: skip
         self.library, self.kind, self.mean_shape = library, _KINDS[own], (batch, time, state)
         self.cov_shape = (batch, time, state, state) if self.propagated else (0,)
@@ -188,18 +178,10 @@ class _Call:
         getattr(library, f"sizes_{self.kind}")(self.sizes, counts)
         self.tape, self.scratch, self.scratch_back = counts
 
-    def layers(self, network: Tensor) -> list[int]:
-        """Return the addresses of weight, bias, weight, ... in a network."""
-        at, found = network.data_ptr(), []
-        for fan_in, fan_out in itertools.pairwise(self.widths):
-            found += [at, at + fan_out * fan_in * network.itemsize]
-            at = found[-1] + fan_out * network.itemsize
-        return found
-
-    def run(self, name: str, *pointers: Tensor | int | None) -> None:
+    def run(self, name: str, *pointers: Tensor | None) -> None:
         """Call a function of the library."""
         found = (ctypes.c_void_p * len(pointers))(
-            *(x.data_ptr() if isinstance(x, Tensor) else x for x in pointers)
+            *[None if x is None else x.data_ptr() for x in pointers]
         )
         getattr(self.library, f"{name}_{self.kind}")(self.sizes, found)
 
@@ -209,7 +191,9 @@ def _doubles(count: int) -> Tensor:
 
 
 def _dense(arguments: Sequence[Any]) -> list[Any]:
-    return [x.contiguous() if isinstance(x, Tensor) else x for x in arguments[:_TENSORS]]
+    """Return the tensors without gaps, the network's after the others."""
+    tensors = (*arguments[:_TENSORS], *arguments[_TENSORS])
+    return [None if x is None else x.contiguous() for x in tensors]
 
 
 def _inverses(call: _Call, covs: Sequence[Tensor]) -> tuple[list[Tensor], Tensor | None]:
@@ -225,14 +209,14 @@ def _inverses(call: _Call, covs: Sequence[Tensor]) -> tuple[list[Tensor], Tensor
 
 def _forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     call, dense = _Call(arguments), _dense(arguments)
-    x, observed, reset, (network, F) = dense[0], dense[1], dense[3], dense[-2:]
+    x, observed, reset, F = dense[0], dense[1], dense[3], dense[16]
     mean, ll = x.new_empty(call.mean_shape), x.new_empty(reset.shape, dtype=torch.float64)
     cov = x.new_empty(call.cov_shape)
     tape, scratch = _doubles(call.tape), _doubles(call.scratch)
     priors, log_det = _inverses(call, dense[9:11])
     call.run(
         "forward", *dense[:7], *priors, *dense[11:16], mean, ll, tape, scratch, F, dense[8],
-        dense[7], cov, *call.layers(network),
+        dense[7], cov, *dense[_TENSORS:],
     )  # fmt: skip
     if log_det is not None:
         ll = ll - 0.5 * torch.where(reset, log_det[1], log_det[0])
@@ -246,7 +230,8 @@ def _backward(
 ) -> list[Tensor]:
     """Return the gradients by observation, action, stored mean, start and the model's tensors."""
     call, dense = _Call(arguments), _dense(arguments)
-    x, observed, action, reset, use_stored, stored, start, _, _, *model, _ = dense
+    x, observed, action, reset, use_stored, stored, start, _, _, *model = dense
+    R, H, B, layers = *model[2:5], model[8:]
     if tape.shape != (call.tape,) or tape.dtype != torch.float64 or not tape.is_contiguous():
         raise ValueError("`tape` must be what filter_rows returned for the same inputs.")
     for by, shape in ((by_mean, call.mean_shape), (by_ll, reset.shape)):
@@ -258,12 +243,11 @@ def _backward(
     if call.information and by_ll is not None:
         by_ll = torch.where(observed.any(-1), by_ll, 0.0)
     by_inputs = [None if v is None else torch.empty_like(v) for v in (x, action, stored, start)]
-    by_model = [torch.empty_like(v) for v in (*priors, *model[2:])]
-    _, _, R, H, B, _, _, network = model
+    by_model = [torch.empty_like(v) for v in (*priors, *model[2:7], *layers)]
     call.run(
         "backward", by_mean, by_ll, reset, use_stored, *priors, H, B, tape,
-        _doubles(call.scratch_back), *by_inputs, *by_model[:7], observed, R,
-        *call.layers(network)[::2], *call.layers(by_model[7]),
+        _doubles(call.scratch_back), *by_inputs, *by_model[:7], observed, R, *layers[::2],
+        *by_model[7:],
     )  # fmt: skip
     if log_det is not None:
         for k, (prior, chosen) in enumerate(zip(priors, (~reset, reset), strict=True)):
@@ -283,17 +267,22 @@ def _forward_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def _backward_fake(*arguments: Any) -> list[Tensor]:
     x, _, action, _, _, stored, start, _, _, *model, _ = arguments[3 : 3 + _TENSORS]
-    return [torch.empty_like(v) for v in (x, action, stored, start, *model) if v is not None]
+    wanted = (x, action, stored, start, *model, *arguments[3 + _TENSORS])
+    return [torch.empty_like(v) for v in wanted if v is not None]
 
 
 class _Filter(torch.autograd.Function):
     """The derivative; one that is differentiated again runs in PyTorch."""
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        output = torch.ops.torchrl_drbpn.filter_rows_forward(*arguments)
-        ctx.rest = arguments[_TENSORS:]
-        ctx.save_for_backward(output[2], *arguments[:_TENSORS])
+    def forward(
+        ctx: Any, residual: bool, tanh: bool, *tensors: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        layers, ctx.flags = list(tensors[_TENSORS:]), (residual, tanh)
+        output = torch.ops.torchrl_drbpn.filter_rows_forward(
+            *tensors[:_TENSORS], layers, residual, tanh
+        )
+        ctx.save_for_backward(output[2], *tensors)
         ctx.mark_non_differentiable(*output[2:])
         ctx.set_materialize_grads(False)
         return output
@@ -302,15 +291,20 @@ class _Filter(torch.autograd.Function):
     def backward(ctx: Any, *by_outputs: Tensor | None) -> tuple[Any, ...]:
         tape, *saved = ctx.saved_tensors
         if not torch.is_grad_enabled():
-            x, action, *stored, start, Q, P0, R, H, B, d, m0, network = (
-                torch.ops.torchrl_drbpn.filter_rows_backward(
-                    *by_outputs[:2], tape, *saved, *ctx.rest
-                )
+            x, action, *by = torch.ops.torchrl_drbpn.filter_rows_backward(
+                *by_outputs[:2], tape, *saved[:_TENSORS], saved[_TENSORS:], *ctx.flags
             )
-            sequence = (x, None, action, None, None, stored[0] if stored else None, start)
-            return (*sequence, None, None, Q, P0, R, H, B, d, m0, network, *(None,) * 4)
-        Q, P0, R, H, B, d, m0, network, F = saved[9:]
-        model = StateSpace(_unpacked(network, Q, B, *ctx.rest), Q, H, R, B, d, m0, P0, F)
+            stored = None if saved[5] is None else by.pop(0)
+            sequence = (x, None, action, None, None, stored, by[0], None, None)
+            return None, None, *sequence, *by[1:8], None, *by[8:]
+        # A tensor may be there twice: each place has a gradient of its own.
+        saved = [None if x is None else x.view_as(x) for x in saved]
+        (Q, P0, R, H, B, d, m0, F), layers = saved[9:_TENSORS], saved[_TENSORS:]
+        residual, tanh = ctx.flags
+        f = TransitionMLP(
+            tuple(layers[::2]), tuple(layers[1::2]), residual, "tanh" if tanh else "relu"
+        )
+        model = StateSpace(f, Q, H, R, B, d, m0, P0, F)
         outputs = run_in_pytorch(model, FilterInputs(*saved[:9]))[::2]
         pairs = [(o, g) for o, g in zip(outputs, by_outputs[:2], strict=True) if g is not None]
         values, weights = zip(*pairs, strict=True)
@@ -319,24 +313,28 @@ class _Filter(torch.autograd.Function):
             values, wanted, weights, create_graph=True, allow_unused=True
         )
         found = {id(x): g for x, g in zip(wanted, gradients, strict=True)}
-        return *(found.get(id(x)) for x in saved), None, None, None
+        return None, None, *(found.get(id(x)) for x in saved)
 
 
 def _differentiable(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Run the operator; acting asks for no gradient, and keeping one costs as much as a step."""
     if torch.is_grad_enabled():
-        return _Filter.apply(*arguments)  # type: ignore[no-untyped-call]
+        flags, tensors = arguments[_TENSORS + 1 :], arguments[:_TENSORS]
+        return _Filter.apply(*flags, *tensors, *arguments[_TENSORS])  # type: ignore[no-untyped-call]
     return torch.ops.torchrl_drbpn.filter_rows_forward(*arguments)
 
 
 def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], Any]:
     """Run the operator for one member of the batch after the other."""
+
+    def member(value: Any, dim: Any, i: int) -> Any:
+        if isinstance(value, list):
+            return [member(*pair, i) for pair in zip(value, dim, strict=True)]
+        return value.select(dim, i) if isinstance(dim, int) else value
+
     runs = [
         torch.ops.torchrl_drbpn.filter_rows(
-            *(
-                value.select(dim, i) if isinstance(dim, int) else value
-                for value, dim in zip(args, in_dims, strict=True)
-            )
+            *(member(*pair, i) for pair in zip(args, in_dims, strict=True))
         )
         for i in range(info.batch_size)
     ]
@@ -346,8 +344,7 @@ def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor
 _ARGUMENTS = (
     "Tensor observation, Tensor observed, Tensor action, Tensor reset, Tensor? use_stored, "
     "Tensor? stored, Tensor start, Tensor? stored_cov, Tensor? cov, Tensor Q, Tensor P0, Tensor R, "
-    "Tensor H, Tensor B, Tensor d, Tensor m0, Tensor network, Tensor? F, int[] widths, "
-    "bool residual, bool tanh"
+    "Tensor H, Tensor B, Tensor d, Tensor m0, Tensor? F, Tensor[] layers, bool residual, bool tanh"
 )
 _LIBRARY: Any = torch.library.Library("torchrl_drbpn", "DEF")  # type: ignore[no-untyped-call]
 # The second is the first without its derivative. (torch.library.register_autograd would make the
