@@ -1,6 +1,5 @@
 """What holds for every test: the native filter is this checkout's, global states are given back."""
 
-import gc
 import shutil
 import subprocess
 import sys
@@ -47,18 +46,6 @@ def folder(smoke, tmp_path):
 def own_directory(tmp_path, monkeypatch):
     """MuJoCo writes the warnings of a model file into the current directory."""
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _memory(request):
-    """What a file has cached and compiled goes with it: forks of a large process may fail."""
-    yield
-    for value in vars(request.module).values():
-        if hasattr(value, "cache_clear"):
-            value.cache_clear()
-    if "torch._dynamo" in sys.modules:
-        torch._dynamo.reset()
-    gc.collect()
 
 
 @pytest.fixture(autouse=True)

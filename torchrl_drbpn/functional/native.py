@@ -154,9 +154,8 @@ class _Call:
                     f"tensor {i} must be {dtype} of shape {shape} on {start.device}, got {x.dtype} "
                     f"{tuple(x.shape)} on {x.device}."
                 )
-        whole = len(layers) == 2 * len(widths) - 2 and widths[-1] == state and bool(layers)
-        whole = whole and (use_stored is None) == (stored is None)
-        if own not in _KINDS or not whole:
+        whole = (len(layers), widths[-1]) == (2 * len(widths) - 2, state)
+        if own not in _KINDS or not whole or (use_stored is None) != (stored is None):
             raise ValueError("float32 or float64, last width state, `use_stored` beside `stored`.")
         needed = [cov is not None, stored_cov is not None or use_stored is None, R.ndim == 1]
         if self.propagated and not all(needed):

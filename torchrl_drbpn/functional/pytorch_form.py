@@ -51,7 +51,6 @@ def run_in_pytorch(model: StateSpace, rows: FilterInputs) -> Filtered:
     H, R, dtype = model.emission_matrix.double(), model.emission_cov.double(), mean.dtype
     added = None if rows.weight is None else _added_noise(R, rows.weight)
     covs = torch.stack([model.full_initial_cov(), model.constant_cov()]).double()
-
     which = (~reset).long().flatten()
 
     def choose(pair: Tensor) -> Tensor:

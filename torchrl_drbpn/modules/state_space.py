@@ -42,10 +42,7 @@ def _tensors(layers: Iterable[nn.Module]) -> tuple[tuple[Tensor, ...], tuple[Ten
 
 def _compact(raw: Tensor, kind: CovKind, min_std: float) -> Tensor:
     """Map free numbers to the variances of a diagonal covariance, or to a full one."""
-    if kind == "full":
-        return full_cov(raw, min_std)
-    std = positive_std(raw, min_std)
-    return std * std
+    return positive_std(raw, min_std).square() if kind == "diag" else full_cov(raw, min_std)
 
 
 class LearnedCovariance(nn.Module):
