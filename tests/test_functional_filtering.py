@@ -251,6 +251,19 @@ def test_every_form_can_be_differentiated_twice(obs, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_layers_that_share_their_weights_have_one_gradient_once_and_twice(form):
+    problem = Problem(3, 4, hidden=(5, 5))
+    weight = problem.leaves["weight1"] = problem.leaves["weight0"]
+    mean, _, ll = problem.library(form)
+    loss = mean.square().sum() + ll.sum()
+    once, again = (
+        torch.autograd.grad(loss, weight, retain_graph=True, create_graph=x)[0]
+        for x in (False, True)
+    )
+    assert_equal(again, once)
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_inputs_are_left_as_they_were(form):
     problem = Problem(3, 5, stored=True)
     given = [*problem.leaves.values(), problem.observed, problem.reset, problem.use_stored]

@@ -154,9 +154,10 @@ def test_a_tape_of_another_call_never_reaches_c():
 
 
 @built
-def test_a_covariance_that_cannot_be_factorised_spoils_its_own_row_alone():
-    problem = Problem(3, 3, batch=5, resets=False)
-    bad = replace(problem.model(), emission_cov=-torch.ones(3, dtype=torch.float64))
+@pytest.mark.parametrize(("obs", "r"), [(3, -100.0), (5, -1e-3)], ids=["innovation", "information"])
+def test_a_covariance_that_cannot_be_factorised_spoils_its_own_row_alone(obs, r):
+    problem = Problem(3, obs, batch=5, resets=False)
+    bad = replace(problem.model(), emission_cov=r * torch.ones(obs).double())
     start, action, x, _, reset = problem.arguments()
     nothing = torch.zeros_like(problem.observed)
     seen = nothing.clone()
@@ -165,6 +166,7 @@ def test_a_covariance_that_cannot_be_factorised_spoils_its_own_row_alone():
         out = filter_sequence(bad, start, action, x, seen, reset, form=form)
         expected = filter_sequence(bad, start, action, x, nothing, reset, form=form)
         assert out.log_likelihood[2, 3].isnan()
+        assert out.mean[2, 3:].isnan().all()
         rows = [0, 1, 3, 4]
         assert torch.equal(out.mean[rows], expected.mean[rows])
         assert torch.equal(out.mean[2, :3], expected.mean[2, :3])
