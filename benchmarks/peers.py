@@ -4,9 +4,12 @@ Training: complete rollouts (frames collected, epochs learned) of every candidat
 
 - the recipe with its defaults, with experiment=paper, and with every belief of conf/belief, on
   corrupted sensors;
-- stable-baselines3's PPO and sb3-contrib's RecurrentPPO (16 environments, minibatches of 64, two
-  layers or an LSTM of width 64), clean sensors;
-- TorchRL's PPO as its MuJoCo example is set (1 environment, 32 minibatches, GAE every epoch).
+- stable-baselines3's PPO and sb3-contrib's RecurrentPPO as they are set (10 epochs of minibatches
+  of 64, two layers or an LSTM of width 64; 16 environments), clean sensors;
+- TorchRL's PPO as its MuJoCo example is set (1 environment, 10 epochs of 32 minibatches, GAE every
+  epoch).
+
+``--peer-epochs 5`` gives the peers as many epochs as the recipe's defaults take.
 
 Decisions: the policies of the beliefs from what one robot, and what all of a batch, sensed. Peers
 that are not installed are left out: pip install -e '.[peers]'.
@@ -118,7 +121,7 @@ class TorchRLRecipe:
 def main() -> None:
     """Run from the command line."""
     known = sorted({path.stem for path in (ROOT / "conf/belief").glob("*.yaml")} - {"drbpn"})
-    args = start(__doc__ or "", env="walker2d", beliefs=known)
+    args = start(__doc__ or "", env="walker2d", beliefs=known, peer_epochs=10)
     warnings.filterwarnings("ignore", category=FutureWarning)  # VecNorm
     small = ["collector.num_envs=2", "collector.steps_per_env=16", "optim.epochs=1"]
     common = [f"env={args.env}", "env.version=v5", *((*small, "optim.minibatches=2") * args.quick)]
@@ -126,7 +129,8 @@ def main() -> None:
     cases |= {f"belief={name}": [f"belief={name}"] for name in args.beliefs}
     ours = {name: recipe(*extra, *common) for name, extra in cases.items()}
     training, settings = ours[DEFAULTS]
-    env_id, epochs = f"{settings.env.id}-{settings.env.version}", settings.optim.epochs
+    env_id = f"{settings.env.id}-{settings.env.version}"
+    epochs = 1 if args.quick else args.peer_epochs
     frames = settings.collector.num_envs * settings.collector.steps_per_env
     candidates: dict[str, Callable[[], Any]] = {n: train(*parts) for n, parts in ours.items()}
     for name, package in ((SB3, "stable_baselines3"), (RECURRENT, "sb3_contrib")):
@@ -139,7 +143,8 @@ def main() -> None:
     seconds = measure(candidates, args)
     learned = {n: sum(x.numel() for x in p.agent.belief.parameters()) for n, (p, _) in ours.items()}
     show(
-        f"{env_id}, {frames} frames and {epochs} epochs a rollout", seconds, DEFAULTS, args,
+        f"{env_id}, rollouts of {frames} frames, epochs: peers {epochs}, defaults "
+        f"{settings.optim.epochs}", seconds, DEFAULTS, args,
         **{"steps/s": frames / seconds.median(), "parameters of the belief": pd.Series(learned)},
     )  # fmt: skip
     # In the middle of a rollout, so that a memory has something in it.
