@@ -228,7 +228,7 @@ def test_a_belief_without_a_spread_leaves_no_older_calibration_behind(folders, t
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -3e6])
 def test_a_belief_that_diverges_stops_its_own_robot_and_no_other(agent, monkeypatch, value):
-    point, protocol = parse("mcar:0.5", agent.settings), Protocol(3, 1, 0, 1, None, 4.0)
+    point, protocol = parse("mcar:0.5", agent.settings), Protocol(3, 2, 0, 1, None, 4.0)
     expected = evaluate_condition(agent, point, ["sampled"], protocol).to_dict("records")
     step, calls, actions = BeliefFilter.step, [], []
 

@@ -227,7 +227,7 @@ def test_more_frames_can_be_added_to_a_finished_run_and_none_taken_away(folder):
     assert resume(folder, "total_frames=768") == 0
     rows = read_table(folder / "metrics.csv")
     assert [int(row["frames"]) for row in rows] == [128, 256, 384, 512, 640, 768]
-    assert float(rows[-1]["lr"]) == pytest.approx(1e-3 * (1 - 640 / 768))
+    assert float(rows[-1]["lr"]) == pytest.approx(2e-3 * (1 - 640 / 768))
     before = (folder / "config.yaml").read_text()
     with refused(r"`total_frames` must be at least the 768 .* got 256"):
         resume(folder, "total_frames=256")
