@@ -3,6 +3,7 @@
 import functools
 import itertools
 import shutil
+import statistics
 
 import pytest
 import torch
@@ -96,7 +97,9 @@ def test_the_step_size_follows_the_divergence(desired, factor):
 def test_the_divergence_comes_to_the_one_asked_for():
     training, config = assembled(*SMOKE, "algo.policy.momentum=0.5")
     kls = [train_rollout(training, config)[0]["kl"] for _ in range(40)]
-    assert 0.001 < sum(kls[20:]) / 20 < 0.004
+    # Not the mean: the rule answers a step that went far, it cannot foresee it. Half to twice
+    # the 2e-3 asked for is where the rule leaves the step size as it is.
+    assert 0.001 < statistics.median(kls[20:]) < 0.004
 
 
 def test_the_generator_of_the_whole_process_is_left_alone():

@@ -70,10 +70,13 @@ def smooth_sequence(
     inputs = FilterInputs(observation, observed, previous_action, reset, None, None, mean)
     model.check_inputs(inputs, reset.shape[:-1])
     H, offset, dtype = model.emission_matrix, model.offset(previous_action), mean.dtype
+    if emission_cov is None:
+        obs = model.obs_dim
+        emission_cov = model.full_emission_cov().expand(*reset.shape, obs, obs)
     with without_autocast(mean):
         filtered, predictions = [], []
         for t in range(reset.shape[-1]):
-            R = model.emission_cov if emission_cov is None else emission_cov[..., t, :, :]
+            R = emission_cov[..., t, :, :]
             given = previous_action[..., t, :], jacobian, reset[..., t]
             predictions.append(_predict(model, belief, *given))
             arrived = (observation[..., t, :], observed[..., t, :], H, R, offset[..., t, :])
