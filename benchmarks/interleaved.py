@@ -47,6 +47,9 @@ def start(description: str, **options: Any) -> argparse.Namespace:
         kind = {} if several else {"type": type(default)}
         parser.add_argument(f"--{name.replace('_', '-')}", default=default, **several, **kind)
     args = parser.parse_args()
+    for name, value in vars(args).items():
+        if type(value) is int and value < 1:
+            parser.error(f"--{name.replace('_', '-')} must be at least 1, got {value}")
     args.rounds = 2 if args.quick else args.rounds
     torch.set_num_threads(args.threads)
     versions = {d.metadata["Name"]: d.version for d in importlib.metadata.distributions()}

@@ -82,6 +82,7 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path):
         ("missingness.eta=much", "`missingness.eta` must be a finite number, got 'much'"),
         ("missingness=mcar missingness.eta=nan", "`missingness.eta` must be a finite number"),
         ("optim.lr=inf", "`optim.lr` must be a finite number, got inf"),
+        ("optim.lr=-1", "`optim.lr` must be at least 0, got -1"),
         ("total_frames=1.5", "`total_frames` must be a whole number, got 1.5"),
         ("total_frames=nan", "`total_frames` must be a whole number, got nan"),
         ("loss.normalize_advantage=3", "`loss.normalize_advantage` must be true or false, got 3"),

@@ -36,6 +36,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("evaluation.final_episodes", "noise.sigma", "noise.scale"), (0, inf)),
     **dict.fromkeys(("advantage.gamma", "advantage.lmbda"), (0, 1)),
     **dict.fromkeys(("loss.critic_coeff", "loss.entropy_coeff", "loss.model_coeff"), (0, inf)),
+    "optim.lr": (0, inf),
     **dict.fromkeys(("optim.max_grad_norm", "loss.clip_epsilon"), (1e-12, inf)),
 }
 
