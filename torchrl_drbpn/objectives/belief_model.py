@@ -53,7 +53,6 @@ class BeliefModelLoss(LossModule):
         done: NestedKey = "done"
         terminated: NestedKey = "terminated"
         final: NestedKey = "final"
-        is_init: NestedKey = "is_init"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -78,8 +77,7 @@ class BeliefModelLoss(LossModule):
         """Entries read; the loss cannot do without the first two."""
         keys = self.tensor_keys
         nexts = (keys.log_likelihood, keys.observed, keys.done, keys.terminated)
-        own = (keys.log_likelihood, keys.observed, keys.final, keys.is_init, "index")
-        return [*own[:2], *map(in_next, nexts), *own[2:]]
+        return [keys.log_likelihood, keys.observed, *map(in_next, nexts), keys.final, "index"]
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Do nothing: this loss estimates no value."""
@@ -120,8 +118,7 @@ class BeliefModelLoss(LossModule):
     def last_steps(self, tensordict: TensorDictBase) -> Tensor:
         """Return which steps, bool ``(*batch, time)``, have a next observation of their own alone.
 
-        Those that terminated, that are ``final`` (the rollout was cut there), or that are ``done``,
-        unless the row goes on without ``is_init``: then its next step holds that observation.
+        Those that terminated, that are ``final`` (the rollout was cut there), or that are ``done``.
         In data of a replay buffer of single steps ``done`` alone does not count: TorchRL's
         SliceSampler writes it where it cuts a slice. Mark the ends of episodes and rollouts as
         ``final`` before such data are stored.
@@ -136,12 +133,7 @@ class BeliefModelLoss(LossModule):
             index = index.reshape(*shape, -1)
             moves = index[..., 1:, :] != index[..., :-1, :]
             done = done & ~moves.any(-1).any(-1, keepdim=True)
-        last = terminated | final | done
-        begins = tensordict.get(keys.is_init, None)
-        if begins is not None and shape:
-            begins = begins.reshape(shape)
-            last = last & torch.cat([begins[..., 1:], torch.ones_like(begins[..., :1])], -1)
-        return last
+        return terminated | final | done
 
     def _read(self, tensordict: TensorDictBase, *keys: NestedKey) -> list[Tensor]:
         found = [tensordict.get(key, None) for key in keys]

@@ -39,7 +39,7 @@ class DRBPNLoss(LossModule):
 
     The input is a batch of sequences, ``[*batch, time]``, cut from rollouts, with the recurrent
     state that the collector stored. Where no other step holds the next observation
-    (:meth:`BeliefModelLoss.last_steps`), a step is inserted there that adds its likelihood.
+    (:meth:`BeliefModelLoss.last_steps`), one more step of the belief module adds its likelihood.
 
     Keys and coefficients are those of the held losses, set here or there. ``actor_network`` and
     ``critic_network`` are the belief module followed by the head.
@@ -79,7 +79,9 @@ class DRBPNLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys(ClipPPOLoss.default_keys, BeliefModelLoss._AcceptedKeys):
-        """Name the entries read: those of the held losses."""
+        """Name the entries read: those of the held losses, and what starts an episode."""
+
+        is_init: NestedKey = "is_init"
 
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.GAE
@@ -250,10 +252,9 @@ class DRBPNLoss(LossModule):
             if params is None
             else params.to_module(self.filter_network, preserve_module_state=False)
         ):
-            if self.model_loss is None:
-                self.filter_network(data)
-            else:
-                self._filter(data, self.model_loss)
+            self.filter_network(data)
+            if self.model_loss is not None:
+                self._add_last_observations(data, self.model_loss)
                 model = self.model_loss(data)
         if self.detach_belief:
             data.update(data.select(*self.filter_network.out_keys, strict=False).detach())
@@ -263,51 +264,29 @@ class DRBPNLoss(LossModule):
             out.update(model)
         return out
 
-    def _filter(self, data: TensorDictBase, model_loss: BeliefModelLoss) -> None:
-        """Run the belief module, over next observations too that no other step holds.
-
-        Each is inserted after its step, so that one pass over longer sequences has them all.
-        """
-        belief, keys = self.filter_network, model_loss.tensor_keys
-        following = data.get("next", None)
+    def _add_last_observations(self, data: TensorDictBase, model_loss: BeliefModelLoss) -> None:
+        """Write the likelihood of the next observation where no other step holds it."""
+        keys, following = model_loss.tensor_keys, data.get("next", None)
         if following is None or following.get(keys.observed, None) is None:
-            belief(data)  # without a next step nothing is added
-            return
+            return  # without a next step nothing is added
         last = model_loss.last_steps(data)
-        time, more = last.shape[-1], last.shape[-1]  # compiled, the number must not vary
-        if not torch.compiler.is_compiling():
-            more = int(last.sum(-1).max()) if last.numel() else 0
-        if not more:
-            belief(data)
-            return
-        step = torch.arange(time, device=last.device).expand(last.shape)
-        place = step + last.cumsum(-1) - last.long()
-        after = (place + 1).clamp_max(time + more - 1)
-        # What stands where: a step, or time + a step for what followed it. What lies beyond the
-        # steps of a sequence is read by nobody.
-        source = last.new_zeros(*last.shape[:-1], time + more, dtype=torch.int64)
-        source = source.scatter(-1, after, step + time).scatter(-1, place, step)
-        given: dict[NestedKey, Tensor] = {}
-        for key in belief.in_keys:
-            if (x := data.get(key, None)) is None:
-                continue
-            if key == keys.is_init:
-                y = torch.zeros_like(x)  # the episode goes on
-            else:  # the recurrent state is what the pass makes of it
-                y = x if in_next(key) in belief.out_keys else following[key]
-            given[key] = _take(torch.cat([x, y], last.ndim - 1), source)
-        longer = belief(TensorDict(given, source.shape, data.device))
-        for key in belief.out_keys:
-            if key[0] != "next":
-                data.set(key, _take(longer.get(key), place))
-        found = _take(longer.get(keys.log_likelihood), after)
-        data.set(in_next(keys.log_likelihood), torch.where(last, found, 0.0))
-
-
-def _take(x: Tensor, index: Tensor) -> Tensor:
-    """Return the steps of x, ``(*batch, time, *)``, that an index ``(*batch, steps)`` names."""
-    time = index.ndim - 1
-    return torch.take_along_dim(x, index.reshape(*index.shape, *(1,) * (x.ndim - time - 1)), time)
+        # a pass over all would cost as much as the filter; compiled, the number must not vary
+        if torch.compiler.is_compiling():
+            index = torch.unravel_index(torch.arange(last.numel(), device=last.device), last.shape)
+        else:
+            index = last.nonzero(as_tuple=True)
+        if not len(index[0]):
+            return  # not every belief module takes an empty batch
+        belief_keys = self.filter_network.in_keys
+        # sequences of one step that continue their episode
+        alone = tuple(x.unsqueeze(-1) for x in index)
+        steps = following.select(*belief_keys, strict=False)[alone]
+        goes_on = torch.zeros(*steps.shape, 1, dtype=torch.bool, device=last.device)
+        steps.set(self._own_keys.is_init, goes_on)
+        self.filter_network(steps)
+        found = steps.get(keys.log_likelihood)
+        everywhere = found.new_zeros(last.shape).index_put(alone, found)
+        data.set(in_next(keys.log_likelihood), everywhere)
 
 
 class _OverSequences(TensorDictSequential):
