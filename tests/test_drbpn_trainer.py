@@ -85,6 +85,18 @@ def test_the_estimator_of_the_loss_is_gae_over_whole_sequences():
         torch.testing.assert_close(received, expected)
 
 
+def test_keys_set_on_the_held_loss_reach_an_estimator_that_is_there():
+    loss = make_loss()
+    loss.make_value_estimator(gamma=0.9, lmbda=0.8)
+    loss.ppo_loss.set_keys(reward="scaled_reward", advantage="adv")
+    data = fresh(loss).exclude("advantage", "value_target", "state_value", ("next", "state_value"))
+    expected = loss.value_estimator(
+        data.copy().rename_key_(("next", "reward"), ("next", "scaled_reward"))
+    )
+    loss.ppo_loss.set_keys(reward="reward", advantage="advantage")
+    torch.testing.assert_close(expected["adv"], loss.value_estimator(data.copy())["advantage"])
+
+
 def test_networks_are_whole_and_their_parameters_are_the_losss():
     loss, data = make_loss(), fresh(make_loss())
     policy, critic = loss.actor_network, loss.critic_network

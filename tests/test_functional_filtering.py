@@ -8,7 +8,7 @@ import torch
 from filter_problems import FORMS, SIZES, Problem, assert_equal, assert_same
 from refusals import refuses
 
-from torchrl_drbpn.functional import filter_sequence, filter_step, filtered_cov
+from torchrl_drbpn.functional import TransitionMLP, filter_sequence, filter_step, filtered_cov
 
 covariances = pytest.mark.parametrize(
     "propagated", [False, True], ids=["constant covariance", "propagated"]
@@ -301,7 +301,21 @@ def cov_of_a_state_dependent_model():
     filtered_cov(model, problem.observed, problem.reset)
 
 
+def run_with_functions(**functions):
+    problem = Problem(3, 5)
+    model = replace(problem.model(), **functions)
+    filter_sequence(model, *problem.arguments())
+
+
 test_wrong_use_is_one_clear_line = refuses(
+    (
+        lambda: run_with_functions(transition=lambda mean, action: mean[..., :1]),
+        "`transition` must return means like its own",
+    ),
+    (
+        lambda: run_with_functions(transition_cov=lambda mean, action: mean.square()),
+        r"`transition_cov` must return \(\*batch, state, state\)",
+    ),
     (lambda: Problem(3, 5).run("fast"), "`form` must be 'auto', 'pytorch' or 'native', got 'f"),
     (lambda: Problem(3, 5).run("auto", use_stored_state=torch.zeros(3, 6).bool()), "together"),
     (lambda: Problem(3, 5).run("auto", stored_mean=torch.zeros(3, 6, 3)), "come together"),
@@ -321,5 +335,10 @@ test_a_state_space_with_a_wrong_field_is_one_clear_line = refuses(
     ({"emission_offset": torch.zeros(5).float()}, "`emission_offset` is torch.float32"),
     ({"action_matrix": ONES[0, 0]}, r"`action_matrix` of shape \(obs, action\)"),
     ({"emission_matrix": torch.zeros(5, 3).long()}, "must be floating point"),
+    ({"transition_cov": 0.3}, "`transition_cov` must be a tensor, got float"),
+    ({"initial_mean": None}, "`initial_mean` must be a tensor, got NoneType"),
+    ({"transition": ONES}, r"`transition` must be a function of \(mean, action\)"),
+    ({"transition": TransitionMLP((), (), False, "relu")}, "must have at least one layer"),
+    ({"transition": TransitionMLP((ONES,), (ONES,), False, "gelu")}, "must be 'relu' or 'tanh', g"),
     make=lambda **wrong: replace(Problem(3, 5).model(), **wrong),
 )

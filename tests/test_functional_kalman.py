@@ -154,6 +154,26 @@ def test_variances_are_a_diagonal_covariance_and_never_a_row():
     assert_equal(F.update(*short).mean, torch.tensor([1 / 1.1, 2 / 1.2]), 1e-6)
     for a, b in zip(outputs(*short), outputs(full, x, seen, eye, r.diag()), strict=True):
         assert torch.equal(a, b)
+    S, v = torch.tensor([0.5, 3.0]).double(), x.double()
+    for function in (
+        lambda cov: F.masked_cov(cov, seen),
+        lambda cov: F.masked_log_density(v, cov, seen),
+        lambda cov: F.nis(v, cov, seen),
+        lambda cov: F.nees(v, cov),
+        lambda cov: F.innovation_weights(v, cov, r, seen, "huber", 4.0),
+    ):
+        assert torch.equal(function(S), function(S.diag()))
+        with pytest.raises(ValueError, match=r"or the variances \(2,\) of a diagonal one, got"):
+            function(S[:1])
+    expected = F.update(full, x, seen, eye, r)
+    for a, b in zip(F.sequential_update(*short), expected, strict=True):
+        assert_equal(a, b, 1e-6)
+    with pytest.raises(ValueError, match=r"must be the variances \(obs,\) of a diagonal R, got"):
+        F.sequential_update(belief, x, seen, eye, r.diag())
+    with pytest.raises(ValueError, match="`emission_matrix` must have shape"):
+        F.sequential_update(belief, x, seen, eye[:1], r)
+    with pytest.raises(ValueError, match="`noise` must be the variances"):
+        F.innovation_weights(v, S, r.diag(), seen[:2], "huber", 4.0)
     for jacobian in (None, 2 * eye):
         a = F.predict(belief, lambda m, _: m, r, x, jacobian=jacobian)
         b = F.predict(full, lambda m, _: m, r.diag(), x, jacobian=jacobian)

@@ -77,8 +77,17 @@ def test_other_masks_and_sensors_are_refused():
     for mask in (torch.ones(4, 2), torch.ones(4).bool()):
         with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
             masked_moments(torch.zeros(4, 2), mask)
-    with pytest.raises(ValueError, match=r"one shape \(\*event\), got \[\(2,\), \(3,\)\]"):
-        merge_moments(nothing(2), nothing(3))
+    for mask in (torch.ones(4, 1).bool(), torch.ones(4).bool()):
+        with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
+            winsorize(torch.zeros(4, 2), mask, nothing(2), EPS)
+    seen = torch.ones(4, 3).bool()
+    for use in (
+        lambda: merge_moments(nothing(2), nothing(3)),
+        lambda: spread(nothing(2)._replace(var=torch.zeros(3)), EPS),
+        lambda: winsorize(torch.zeros(4, 3), seen, nothing(2), EPS),
+    ):
+        with pytest.raises(ValueError, match=r"one shape \(\*event\).* got \[\(2,\), \(3,\)\]"):
+            use()
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.9])

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import check_observed, masked_cov, zero_missing
+from torchrl_drbpn.functional.gaussian import as_matrix, check_observed, masked_cov, zero_missing
 
 _BISECTIONS = 100  # halve an interval until float64 has no number between its ends
 
@@ -26,7 +26,8 @@ def nis(innovation: Tensor, innovation_cov: Tensor, observed: Tensor) -> Tensor:
 
     Args:
         innovation: v of :func:`innovation`, shape ``(*batch, obs)``.
-        innovation_cov: S over all entries, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
+        innovation_cov: S over all entries, shape ``(*batch, obs, obs)``, or ``(obs,)`` for its
+            diagonal.
         observed: bool M, shape ``(*batch, obs)``, True = counts; a ValueError for another.
 
     Example:
@@ -45,13 +46,13 @@ def nees(error: Tensor, cov: Tensor) -> Tensor:
 
     §5.4 [Bar-Shalom 2001]. If the belief is right it is chi-square distributed with the dimension
     of the state as degrees of freedom. Of e, truth minus estimate, ``(*batch, state)``, and P,
-    ``(*batch, state, state)`` or ``(state, state)``; ``(*batch,)``, no unit, float64.
+    ``(*batch, state, state)`` or, its diagonal, ``(state,)``; ``(*batch,)``, no unit, float64.
 
     Example:
         >>> nees(torch.tensor([3.0, 2.0]), torch.diag(torch.tensor([9.0, 4.0]))).item()
         2.0
     """
-    factor = torch.linalg.cholesky(cov.double())
+    factor = torch.linalg.cholesky(as_matrix("cov", cov, error.shape[-1]).double())
     white = torch.linalg.solve_triangular(factor, error.double().unsqueeze(-1), upper=False)
     return white.square().sum((-2, -1))
 

@@ -169,8 +169,7 @@ def _filter(model: StateSpace, given: FilterInputs, return_cov: bool, form: Form
     reason: str | None = "PyTorch was asked for"
     if form != "pytorch":
         floats = given.observation, given.previous_action, *given[5:9]
-        reason = native.unsupported_reason(model, *floats)
-        reason = "it takes no weights" if reason is None and weight is not None else reason
+        reason = native.unsupported_reason(model, *floats, weight=weight)
         if reason is not None and form == "native":
             raise ValueError(f"`form` 'native' cannot run here: {reason}. Use form='auto'.")
         if not torch.compiler.is_compiling() and reason and reason == native.native_status():

@@ -73,14 +73,15 @@ def masked_cov(cov: Tensor, observed: Tensor) -> Tensor:
     .. math:: A = (m m') \circ S + \mathrm{diag}(1 - m)
 
     Determinant of A and inverse on the observed block are those of ``M S M'`` (eq. 10 and 12
-    [DRBPN]), with a static shape: S is ``(*batch, obs, obs)`` or ``(obs, obs)``, ``observed``
-    ``(*batch, obs)``, A ``(*batch, obs, obs)``.
+    [DRBPN]), with a static shape: S is ``(*batch, obs, obs)`` or, its diagonal, ``(obs,)``,
+    ``observed`` ``(*batch, obs)``, A ``(*batch, obs, obs)``.
 
     Example:
         >>> cov = torch.tensor([[2.0, 1.0], [1.0, 2.0]])
         >>> masked_cov(cov, torch.tensor([True, False])).tolist()
         [[2.0, 0.0], [0.0, 1.0]]
     """
+    cov = as_matrix("cov", cov, observed.shape[-1])
     both = observed.unsqueeze(-1) & observed.unsqueeze(-2)
     eye = torch.eye(cov.shape[-1], dtype=cov.dtype, device=cov.device)
     return torch.where(both, cov, eye)
@@ -99,6 +100,7 @@ def masked_log_density(residual: Tensor, cov: Tensor, observed: Tensor) -> Tenso
         >>> masked_log_density(torch.ones(2), torch.eye(2), nothing).item() == 0
         True
     """
+    check_observed(residual, observed)
     residual = zero_missing(residual, observed)
     factor = factorise("`cov`", masked_cov(cov, observed))
     white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)

@@ -82,7 +82,12 @@ def predict(
 
 
 def _covariances(
-    belief: Belief, observation: Tensor, observed: Tensor, H: Tensor, R: Tensor
+    belief: Belief,
+    observation: Tensor,
+    observed: Tensor,
+    H: Tensor,
+    R: Tensor,
+    offset: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Check the sizes of an update; return H, P and R as float64 matrices."""
     check_observed(observation, observed)
@@ -91,6 +96,11 @@ def _covariances(
         raise ValueError(
             f"`emission_matrix` must have shape (obs, state) = {(obs, state)}, got "
             f"{tuple(H.shape)}: `observation` and `belief.mean` say the sizes."
+        )
+    if offset is not None and offset.shape[-1:] != (obs,):
+        raise ValueError(
+            f"`offset` must have shape (*batch, obs) = {tuple(observation.shape)}, got "
+            f"{tuple(offset.shape)}."
         )
     P, R = as_matrix("belief.cov", belief.cov, state), as_matrix("emission_cov", R, obs)
     return H.double(), P.double(), R.double()
@@ -126,15 +136,9 @@ def innovation(
         >>> v.tolist(), S.diagonal().tolist()
         ([1.0, 0.0], [2.0, 2.0])
     """
-    H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov)
+    H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov, offset)
     expected = (H @ belief.mean.double().unsqueeze(-1)).squeeze(-1)
-    if offset is not None:
-        if offset.shape[-1:] != observation.shape[-1:]:
-            raise ValueError(
-                f"`offset` must have shape (*batch, obs) = {tuple(observation.shape)}, got "
-                f"{tuple(offset.shape)}."
-            )
-        expected = expected + offset
+    expected = expected if offset is None else expected + offset
     # Zero first, subtract after: a NaN under a False mask must reach neither value nor gradient.
     residual = zero_missing(zero_missing(observation, observed) - expected, observed)
     return Belief(residual, H @ P @ H.mT + R)
@@ -167,7 +171,7 @@ def update(
         ([0.25, 0.0], True)
     """
     dtype = belief.mean.dtype
-    H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov)
+    H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov, offset)
     v, S = innovation(belief, observation, observed, H, R, offset)
     factor = factorise("the innovation covariance H P H' + R", masked_cov(S, observed))
     # K' = A^-1 (M'M) H P: the rows of missing entries are zero, so K ignores them.
@@ -195,8 +199,9 @@ def sequential_update(
         s_i = h_i' P h_i + r_i, \quad k_i = P h_i / s_i, \quad
         m \leftarrow m + k_i (x_i - h_i' m), \quad P \leftarrow P - k_i h_i' P
 
-    Arguments and result are those of :func:`update`, R diagonal [Anderson and Moore 1979]. Nothing
-    is factorised: what has no Cholesky decomposition, such as ONNX, can run it.
+    Arguments and result are those of :func:`update`, R by its diagonal ``(obs,)`` alone [Anderson
+    and Moore 1979]; a ValueError for a matrix. Nothing is factorised: what has no Cholesky
+    decomposition, such as ONNX, can run it.
 
     Example:
         >>> belief, H = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([[1.0, 0.0], [1.0, 1.0]])
@@ -204,9 +209,15 @@ def sequential_update(
         >>> all(torch.allclose(a, b) for a, b in zip(sequential_update(*step), update(*step)))
         True
     """
-    dtype, (m, P) = belief.mean.dtype, (belief.mean.double(), belief.cov.double())
+    if emission_cov.ndim != 1:
+        raise ValueError(
+            "`emission_cov` must be the variances (obs,) of a diagonal R, got "
+            f"{tuple(emission_cov.shape)}: readings that depend on each other need `update`."
+        )
+    H, P, _ = _covariances(belief, observation, observed, emission_matrix, emission_cov, offset)
+    dtype, m = belief.mean.dtype, belief.mean.double()
     x = zero_missing(observation if offset is None else observation - offset, observed).double()
-    for i, (h, r) in enumerate(zip(emission_matrix.double(), emission_cov.double(), strict=True)):
+    for i, (h, r) in enumerate(zip(H, emission_cov.double(), strict=True)):
         along = P @ h
         gain = along / ((along * h).sum(-1, keepdim=True) + r)
         gain = zero_missing(gain, observed[..., i : i + 1])

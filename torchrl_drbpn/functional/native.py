@@ -64,7 +64,9 @@ def native_status() -> str | None:
     return library if isinstance(library, str) else None
 
 
-def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None:
+def unsupported_reason(
+    model: StateSpace, *tensors: Tensor | None, weight: Tensor | None = None
+) -> str | None:
     """Say why the native form does not take this model and these inputs; None where it does."""
     f, Q = model.transition, model.transition_cov
     if not isinstance(f, TransitionMLP) or not isinstance(Q, Tensor):
@@ -104,7 +106,7 @@ def unsupported_reason(model: StateSpace, *tensors: Tensor | None) -> str | None
         return f"the transition has more than {_MAX_LAYERS} layers"
     if any(x.numel() == 0 for x in given):
         return "there is nothing to filter"
-    return native_status()
+    return native_status() if weight is None else "it takes no weights"
 
 
 def filter_rows(model: StateSpace, rows: FilterInputs) -> Filtered:

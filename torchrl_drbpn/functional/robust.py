@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn.functional.gaussian import (
+    as_matrix,
+    check_observed,
     masked_cov,
     rounded_cov,
     without_autocast,
@@ -50,7 +52,7 @@ def innovation_weights(
 
     Args:
         residual: v, shape ``(*batch, obs)``, 0 where nothing arrived.
-        innovation_cov: S, float64, shape ``(*batch, obs, obs)`` or ``(obs, obs)``.
+        innovation_cov: S, float64, shape ``(*batch, obs, obs)``, or ``(obs,)`` for its diagonal.
         noise: r, the diagonal of R, shape ``(obs,)`` or ``(*batch, obs)``.
         observed: bool, shape ``(*batch, obs)``, True = arrived.
         robust: "huber" or "imq".
@@ -66,6 +68,13 @@ def innovation_weights(
         >>> bool(w[0] < 0.15), w[1:].tolist()
         (True, [1.0, 1.0, 1.0, 1.0])
     """
+    check_observed(residual, observed)
+    if noise.shape not in (residual.shape, residual.shape[-1:]):
+        raise ValueError(
+            f"`noise` must be the variances (obs,) or (*batch, obs) of a diagonal R, (*batch, obs) "
+            f"= {tuple(residual.shape)}, got {tuple(noise.shape)}."
+        )
+    innovation_cov = as_matrix("innovation_cov", innovation_cov, residual.shape[-1])
     variance = innovation_cov.diagonal(dim1=-2, dim2=-1)
     marginal = residual.abs() / variance.sqrt()
     # Of n that arrived, the lower median of the n - 1 others is sorted[k], or the next one where

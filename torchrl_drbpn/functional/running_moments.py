@@ -71,12 +71,7 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
         >>> torch.allclose(split.var, masked_moments(x).var)
         True
     """
-    shapes = {tuple(field.shape) for field in (*first, *second)}
-    if len(shapes) > 1:
-        raise ValueError(
-            "`RunningMoments` can only be merged if every field has one shape (*event), got "
-            f"{sorted(shapes)}. Are they of different sensors?"
-        )
+    _check_shapes(*(field.shape for field in (*first, *second)))
     count = first.n + second.n
     # The clamp only meets a count of 0, where the weight is 0 anyway.
     weight = second.n / count.clamp_min(1)
@@ -92,11 +87,14 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
 def spread(moments: RunningMoments, eps: float) -> Tensor:
     """Return the deviation sqrt(var + eps), and 1 where fewer than two values were seen.
 
+    A ValueError for moments whose fields have different shapes.
+
     Example:
         >>> x = torch.randn(9, 2, dtype=torch.float64)
         >>> torch.allclose(spread(masked_moments(x), 0.0), x.std(0, correction=0))
         True
     """
+    _check_shapes(*(field.shape for field in moments))
     return torch.where(moments.n < 2, 1.0, (moments.var + eps).sqrt())
 
 
@@ -112,7 +110,8 @@ def winsorize(
     readings nothing is learned, as an outlier among them could not be recognised.
 
     Of readings ``(samples, *event)``, finite where the bool ``observed`` is True, and the moments
-    learned so far it returns the readings, float64, and which of them to learn from.
+    learned so far it returns the readings, float64, and which of them to learn from. A ValueError
+    for a mask or moments of other sizes.
 
     Example:
         >>> nothing = RunningMoments(*torch.zeros(3, 1, dtype=torch.float64))
@@ -120,6 +119,8 @@ def winsorize(
         >>> bool(winsorize(x, torch.ones_like(x) > 0, nothing, 1e-8)[0].max() < 30)
         True
     """
+    check_observed(value, observed)
+    _check_shapes(value.shape[1:], *(field.shape for field in learned))
     value = value.double().masked_fill(~observed, 0.0).clamp(-_LARGEST, _LARGEST)
     known = (learned.n >= _ENOUGH) & (learned.var > eps)
     centre, radius = learned.mean.double(), _WIDTH * learned.var.double().sqrt()
@@ -133,6 +134,14 @@ def winsorize(
         centre = torch.where(known, centre, middle)
         radius = torch.where(known, radius, reach)
     return torch.minimum(torch.maximum(value, centre - radius), centre + radius), observed
+
+
+def _check_shapes(*shapes: torch.Size) -> None:
+    if len(set(shapes)) > 1:
+        raise ValueError(
+            "every field of `RunningMoments` must have the one shape (*event) of the sensors, got "
+            f"{sorted(map(tuple, set(shapes)))}. Are they of different sensors?"
+        )
 
 
 def _gather(value: Tensor, rank: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import Belief, as_matrix, factorise, without_autocast
+from torchrl_drbpn.functional.gaussian import Belief, factorise, without_autocast
 from torchrl_drbpn.functional.kalman import update, update_by_mask
 from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, TransitionMLP
 
@@ -177,9 +177,8 @@ def _predict(
         F = row_jacobian(model.transition, mean, action)
     elif not isinstance(F, Tensor):
         F = F(mean, action)
-    Q = model.transition_cov
-    Q = as_matrix("transition_cov", Q if isinstance(Q, Tensor) else Q(mean, action), mean.shape[-1])
-    F, Q, block = F.double(), Q.double(), row.unsqueeze(-1)
+    Q, block = model.predicted_cov(mean, action).double(), row.unsqueeze(-1)
+    F = F.double()
     F = torch.where(block, 0.0, F)
     moved = F @ belief.cov.masked_fill(block, 0.0) @ F.mT
     cov = torch.where(block, model.full_initial_cov().double(), 0.5 * (moved + moved.mT) + Q)

@@ -171,24 +171,36 @@ class StateSpace:
             ("emission_cov", self.emission_cov, (obs, obs)),
             ("initial_cov", self.initial_cov, (state, state)),
         ]
-        if isinstance(self.transition_cov, Tensor):
+        if not callable(self.transition):
+            raise ValueError(
+                "`transition` must be a function of (mean, action), got "
+                f"{type(self.transition).__name__}."
+            )
+        if not callable(self.transition_cov):
             fields.append(("transition_cov", self.transition_cov, (state, state)))
         for name, value in (self.mask_model._asdict() if self.mask_model else {}).items():
             fields.append((f"mask_model.{name}", value, (obs,)))
-        if isinstance(self.transition_jacobian, Tensor):
+        if self.transition_jacobian is not None and not callable(self.transition_jacobian):
             fields.append(("transition_jacobian", self.transition_jacobian, (state, state)))
         if isinstance(self.transition, TransitionMLP):
             weights, biases = self.transition.weights, self.transition.biases
-            if len(weights) != len(biases):
+            if not len(weights) == len(biases) > 0:
                 raise ValueError(
-                    f"`transition` must have as many biases as weights, got {len(biases)} and "
-                    f"{len(weights)}."
+                    "`transition` must have at least one layer and as many biases as weights, got "
+                    f"{len(biases)} and {len(weights)}."
+                )
+            if self.transition.activation not in ("relu", "tanh"):
+                raise ValueError(
+                    "`transition.activation` must be 'relu' or 'tanh', got "
+                    f"{self.transition.activation!r}: pass a function of (mean, action) for others."
                 )
             widths = [state + action, *(len(bias) for bias in biases[:-1]), state]
             for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
                 fields.append((f"transition.weights[{i}]", weights[i], (fan_out, fan_in)))
                 fields.append((f"transition.biases[{i}]", biases[i], (fan_out,)))
         for name, value, shape in fields:
+            if not isinstance(value, Tensor):
+                raise ValueError(f"`{name}` must be a tensor, got {type(value).__name__}.")
             diagonal = name.endswith("cov") and value.shape == shape[1:]
             if value.shape != shape and not diagonal:
                 either = f" or {shape[1:]}, its diagonal" if name.endswith("cov") else ""
@@ -290,7 +302,25 @@ class StateSpace:
         """Return f(mean, action), or m_0 where an episode starts; reset: ``(*batch, 1)``."""
         # A NaN before an episode start would reach the transition's weights as 0 * NaN.
         mean = mean.masked_fill(reset, 0.0)
-        return torch.where(reset, self.initial_mean, self.transition(mean, previous_action))
+        moved = self.transition(mean, previous_action)
+        if moved.shape != mean.shape:
+            raise ValueError(
+                f"`transition` must return means like its own, {tuple(mean.shape)}, got "
+                f"{tuple(moved.shape)}."
+            )
+        return torch.where(reset, self.initial_mean, moved)
+
+    def predicted_cov(self, mean: Tensor, previous_action: Tensor) -> Tensor:
+        """Return Q at a mean, shape ``(state, state)`` or ``(*batch, state, state)``."""
+        if isinstance(self.transition_cov, Tensor):
+            return self.constant_cov()
+        cov = self.transition_cov(mean, previous_action)
+        if cov.shape != (*mean.shape, self.state_dim):
+            raise ValueError(
+                "`transition_cov` must return (*batch, state, state) = "
+                f"{(*mean.shape, self.state_dim)}, got {tuple(cov.shape)}."
+            )
+        return cov
 
 
 def propagate(jacobian: Tensor, cov: Tensor) -> Tensor:
@@ -337,8 +367,7 @@ def predict_step(
     row = reset.unsqueeze(-1)
     predicted = model.predicted_mean(mean, previous_action, row)
     mean = mean.masked_fill(row, 0.0)
-    Q, F = model.transition_cov, model.transition_jacobian
-    after = model.constant_cov() if isinstance(Q, Tensor) else Q(mean, previous_action)
+    after, F = model.predicted_cov(mean, previous_action), model.transition_jacobian
     if F is not None:
         if cov is None:
             raise ValueError("`cov` is None, but this model propagates its covariance.")

@@ -13,6 +13,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import ValueEstimators
+from torchrl.objectives.value import ValueEstimatorBase
 
 from torchrl_drbpn.objectives.belief_model import BeliefModelLoss, in_next
 
@@ -232,6 +233,19 @@ class DRBPNLoss(LossModule):
         ClipPPOLoss.make_value_estimator(self, value_type, **hyperparams)
         return self
 
+    @property
+    def value_estimator(self) -> ValueEstimatorBase:
+        """The estimator of advantages, by the names that the entries have in the held losses."""
+        estimator: ValueEstimatorBase = LossModule.value_estimator.fget(self)
+        known = {field.name for field in fields(estimator.default_keys)}
+        keys = {name: key for name, key in vars(self.tensor_keys).items() if name in known}
+        estimator.set_keys(**keys)
+        return estimator
+
+    @value_estimator.setter
+    def value_estimator(self, value: ValueEstimatorBase | None) -> None:
+        LossModule.value_estimator.fset(self, value)
+
     def reset_parameters_recursive(self) -> None:
         """Put every parameter back to where a new module starts, the held losses' too."""
         super().reset_parameters_recursive()
@@ -246,7 +260,7 @@ class DRBPNLoss(LossModule):
                 f"`{advantage}` is not in the tensordict: compute advantages over the whole "
                 "rollout first (TorchRL's GAE), then cut it into minibatches."
             )
-        data, params, model = tensordict.clone(False), self.filter_network_params, None
+        data, params = tensordict.clone(False), self.filter_network_params
         with (
             nullcontext()
             if params is None
@@ -255,11 +269,13 @@ class DRBPNLoss(LossModule):
             self.filter_network(data)
             if self.model_loss is not None:
                 self._add_last_observations(data, self.model_loss)
-                model = self.model_loss(data)
+        read = data
         if self.detach_belief:
-            data.update(data.select(*self.filter_network.out_keys, strict=False).detach())
-        out: TensorDictBase = self.ppo_loss(data)
-        if model is not None:
+            belief = data.select(*self.filter_network.out_keys, strict=False).detach()
+            read = data.copy().update(belief)
+        out: TensorDictBase = self.ppo_loss(read)
+        if self.model_loss is not None:
+            model = self.model_loss(data)
             model.set("loss_model", self.model_coeff * model.get("loss_model"))
             out.update(model)
         return out
