@@ -52,7 +52,10 @@ def main():
 
 
 def fuzz(count=400):
-    """Call the operator and its gradient with random sizes, half of the calls with one spoilt."""
+    """Call the operator and its gradient with random sizes, half of the calls with one spoilt.
+
+    The gradient is called by itself too, with the tape, or another one, before the arguments.
+    """
     import torch
     from filter_problems import Problem
 
@@ -70,24 +73,43 @@ def fuzz(count=400):
         )  # fmt: skip
         arguments = problem.operator_arguments()
         spoilt = draw.random() < 0.5
+        full = problem.full_noise and problem.jacobian is not None  # which it does not take
+        given = list(arguments)
         if spoilt:
-            place = draw.randrange(18)
-            value = arguments[place]
-            if isinstance(value, torch.Tensor):
-                dims = [max(0, n + draw.choice([-1, 0, 0, 1])) for n in value.shape]
-                dtype = draw.choice([value.dtype, torch.float16])
-                arguments[place] = torch.zeros(dims, dtype=dtype)
-            elif isinstance(value, list):
-                arguments[place] = value[: draw.randrange(len(value))]
+            spoil(draw, given, draw.randrange(18))
         try:
-            out = operator(*arguments)
+            out = operator(*given)
         except (ValueError, RuntimeError):
-            full = problem.full_noise and problem.jacobian is not None  # which it does not take
             assert spoilt or full
             refused += 1
+        else:
+            (out[0].sum() + out[1].sum()).backward()
+        if full:
             continue
-        (out[0].sum() + out[1].sum()).backward()
-    print(f"{count} calls, {refused} refused")  # noqa: T201
+        mean, ll, tape, _ = operator(*arguments)
+        back = [torch.ones_like(mean), torch.ones_like(ll), tape, *arguments]
+        if spoilt:
+            spoil(draw, back, draw.randrange(21))
+        try:
+            with torch.no_grad():
+                torch.ops.torchrl_drbpn.filter_rows_backward(*back)
+        except (ValueError, RuntimeError):
+            assert spoilt
+            refused += 1
+    print(f"{count} problems, each forward and back, {refused} calls refused")  # noqa: T201
+
+
+def spoil(draw, arguments, place):
+    """Give one argument another size or dtype, or a network fewer layers."""
+    import torch
+
+    value = arguments[place]
+    if isinstance(value, torch.Tensor):
+        dims = [max(0, n + draw.choice([-1, 0, 0, 1])) for n in value.shape]
+        dtype = draw.choice([value.dtype, torch.float16])
+        arguments[place] = torch.zeros(dims, dtype=dtype)
+    elif isinstance(value, list):
+        arguments[place] = value[: draw.randrange(len(value))]
 
 
 if __name__ == "__main__":

@@ -107,6 +107,25 @@ def test_padded_data_are_taken(make_module):
 
 
 @without_a_primer
+@EVERY
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3)], ids=str)
+def test_a_sequence_with_starts_inside_equals_its_steps(make_module, shape):
+    # test_multi_consecutive of GRUModule: sequences in one call, then the same step by step
+    module = make_module(**BARE)
+    data = frames(*shape, TIME)
+    data["is_init"][(0,) * len(shape) + (TIME // 2,)] = True
+    with set_recurrent_mode(True):
+        whole = module(data.clone())
+    step = frames(*shape, 1)[..., 0].select("observation", "is_init")
+    for t in range(TIME):
+        step.update(data[..., t])
+        step = step_mdp(module(step), keep_other=True)
+    torch.testing.assert_close(
+        step["features"], whole["features"][..., -1, :], rtol=1e-4, atol=1e-5
+    )
+
+
+@without_a_primer
 @pytest.mark.parametrize("over_time", [False, True])
 def test_vmap_over_stacked_parameters_is_a_loop(over_time):
     # PyTorch's fused GRU, in GRUModule and over particles, has no batching rule

@@ -11,7 +11,7 @@ import recipe_tools
 import torch
 from contracts import saved
 from evaluation.trained import evaluate_training
-from ppo_drbpn import train_rollout
+from ppo_drbpn import collect, train_rollout
 from recipe_tools import SMOKE, assembled, assert_same_run, differences, read_table, refused, run
 from tqdm import tqdm
 from training.checkpoint import last_checkpoint
@@ -57,6 +57,23 @@ def test_a_logger_by_name_writes_its_file(tmp_path, name, file, words):
     pytest.importorskip(name)
     run(tmp_path / "run", *SMOKE, f"logger={name}", "total_frames=128", *words)
     assert list((tmp_path / "run").glob(file))
+
+
+def test_first_statistics_are_of_a_rollout_that_is_not_trained_on(monkeypatch):
+    training, config = assembled(*SMOKE)
+    rollouts, learned = [], []
+    update = training.algorithm.update
+    monkeypatch.setattr(
+        training.algorithm, "update", lambda data, left: learned.append(data) or update(data, left)
+    )
+    monkeypatch.setattr(
+        "ppo_drbpn.collect", lambda training: rollouts.append(collect(training)) or rollouts[-1]
+    )
+    for _ in range(2):
+        train_rollout(training, config)
+    assert len(rollouts) == 3
+    assert list(map(id, learned)) == list(map(id, rollouts[1:]))
+    assert training.frames == sum(data.numel() for data in learned)
 
 
 def test_the_statistics_are_constant_while_a_rollout_is_collected_and_learned_from():
