@@ -21,7 +21,7 @@ from evaluation.folders import find_folders, output_folder, with_checkpoint
 from evaluation.trained import load_trained_agent
 from rendering.style import save_figure
 from training.config import check_limits, check_mode, command
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 from training.run_folder import write_table
 
@@ -83,7 +83,7 @@ def _draw(folder: Path) -> int:
             (folder / name).unlink(missing_ok=True)
         else:
             save_figure(figure, folder / name, dpi=100)
-    say(f"written: {folder}")
+    log_line(f"written: {folder}")
     return 0
 
 
@@ -96,7 +96,7 @@ def _diagnoses(
         trained = load_trained_agent(folder)
         columns = {"run": folder.name} | trained.columns()
         if trained.agent.observing is None:
-            say(
+            log_line(
                 f"{folder.name}: belief={columns['belief']} keeps no estimate of its sensors; the "
                 "rows are those of the last value and the running mean"
             )
@@ -107,9 +107,9 @@ def _diagnoses(
             try:
                 tally = diagnose(trained, condition, removed, **options)
             except BeliefDivergedError as error:
-                say(f"{folder.name}, {condition.name}: no rows, {error}")
+                log_line(f"{folder.name}, {condition.name}: no rows, {error}")
                 continue
-            say(f"{folder.name}, {condition.name}, {_summary(tally)}")
+            log_line(f"{folder.name}, {condition.name}, {_summary(tally)}")
             yield (columns | {"point": condition.name, "mode": config["mode"], "runs": 1}, tally)
 
 

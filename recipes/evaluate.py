@@ -23,7 +23,7 @@ from evaluation.table import Protocol, Table, evaluate_tasks
 from evaluation.trained import TrainedAgent, load_trained_agent
 from rendering.style import save_figure
 from training.config import check_limits, check_mode, command
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 from training.sensors import have_names
 
@@ -46,19 +46,19 @@ def run(config: dict[str, Any]) -> int:
     lacking = [(f, c, table.lacks(f.name, c, config["modes"])) for f, c in wanted]
     tasks = [task for task in lacking if task[2]]
     if len(tasks) < len(wanted):
-        say(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
+        log_line(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
     processes = config["processes"] or joblib.cpu_count()
     for done, (task, rows) in enumerate(evaluate_tasks(tasks, protocol, processes), 1):
         table.add(rows)
-        say(f"{done}/{len(tasks)} {task[0].name} {task[1].name}: {_summary(rows)}")
+        log_line(f"{done}/{len(tasks)} {task[0].name} {task[1].name}: {_summary(rows)}")
     table.arrange([(folder.name, condition.name) for folder, condition in wanted])
     table.write()
-    say(f"written: {output}")
+    log_line(f"written: {output}")
     if config["figures"]:
         for env_id, figure in draw_evaluation(pd.read_csv(output)).items():
             path = output.with_name(f"{output.stem}-{env_id}.png")
             save_figure(figure, path, dpi=120)
-            say(f"written: {path}")
+            log_line(f"written: {path}")
     return 0
 
 
@@ -99,10 +99,12 @@ def _conditions(config: dict[str, Any], folder: Path, trained: TrainedAgent) -> 
             kept_sensors(trained, 0)
         except UserError as error:
             model = False
-            say(f"{folder.name}: sensors are removed at random only; {error}")
+            log_line(f"{folder.name}: sensors are removed at random only; {error}")
         if config["full"] and not have_names(trained.sensors):
             levels["outage_groups"] = ["sensor"]
-            say(f"{folder.name}: outages of single sensors only, these have no names to group by")
+            log_line(
+                f"{folder.name}: outages of single sensors only, these have no names to group by"
+            )
         texts = default_conditions(levels, full=config["full"], model=model)
     listed = [texts] if isinstance(texts, str) else texts
     return parse_conditions(listed, trained.settings, spike_std=float(config["spike_std"]))

@@ -28,7 +28,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from training.agent import add_primers
 from training.config import check_limits, command
-from training.console import say
+from training.console import log_line
 from training.envs import make_env
 from training.errors import UserError
 from training.run_folder import whole
@@ -73,14 +73,14 @@ def run(config: dict[str, Any]) -> int:
         ]
     for what, names, values in (("in", INPUTS, inputs), ("out", OUTPUTS, decide(*inputs))):
         parts = [f"{n} {_described(v)}" for n, v in zip(names, values, strict=False)]
-        say(f"{what}: {', '.join(parts)}")
+        log_line(f"{what}: {', '.join(parts)}")
     episodes, missing = int(data["is_init"].sum()), 1 - data["observed"].double().mean().item()
-    say(
+    log_line(
         f"{data.numel()} steps, episodes {episodes}, missing {missing:.3f}: actions, at most "
         f"{largest:.3g}, differ from the agent's by at most {difference:.2g}"
     )
-    say(f"a decision takes {times[0]:,.0f} us from Python, of the agent {times[1]:,.0f} us")
-    say(f"written: {out} ({kind}, {out.stat().st_size / 1e6:.2f} MB)")
+    log_line(f"a decision takes {times[0]:,.0f} us from Python, of the agent {times[1]:,.0f} us")
+    log_line(f"written: {out} ({kind}, {out.stat().st_size / 1e6:.2f} MB)")
     return 0
 
 

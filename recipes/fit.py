@@ -22,7 +22,7 @@ from rendering.style import STYLE, legend_below, panel_grid, save_figure
 from safetensors.torch import save_file
 from tensordict import TensorDict
 from training.config import build, check_limits, command
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 from training.run_folder import write_table
 
@@ -52,23 +52,23 @@ def run(config: dict[str, Any]) -> int:
         raise UserError(f"`belief` must be drbpn or drbpn_propagated here, got {name}.")
     if config["out"] is None or Path(config["out"]).is_file():
         raise UserError(f"`out` must be a folder, such as fits/arm, got {config['out']}.")
-    log = read_log(
+    records = read_log(
         config["data"], _list(config["observation"]), _list(config["action"]), config["episode"]
     )
-    if len(log.episodes) < 2:
-        raise UserError(f"`episode` must tell two episodes apart at least, got {log.episodes}.")
+    if len(records.episodes) < 2:
+        raise UserError(f"`episode` must tell two episodes apart at least, got {records.episodes}.")
     torch.set_num_threads(config["threads"])
     torch.manual_seed(config["seed"])
-    train, validation, test = split(len(log.episodes), config["hold_out"], config["seed"])
-    norm = MaskedObservationNorm(len(log.names))
+    train, validation, test = split(len(records.episodes), config["hold_out"], config["seed"])
+    norm = MaskedObservationNorm(len(records.names))
     known = torch.unique(torch.cat([train, validation]))
-    episodes = {"observation": log.observation[known], "observed": log.observed[known]}
-    norm.update(TensorDict(episodes, batch_size=log.reset[known].shape))
+    episodes = {"observation": records.observation[known], "observed": records.observed[known]}
+    norm.update(TensorDict(episodes, batch_size=records.reset[known].shape))
     if (norm.count < 2).any():
-        name = log.names[int(norm.count.argmin())]
+        name = records.names[int(norm.count.argmin())]
         raise UserError(f"column `{name}` has no readings outside the held-out episodes.")
-    x = norm.normalize(log.observation, log.observed).float()
-    data = Sequences(log.previous_action, x, log.observed, log.reset)
+    x = norm.normalize(records.observation, records.observed).float()
+    data = Sequences(records.previous_action, x, records.observed, records.reset)
     filters = {}
     linear = copy.deepcopy(config["belief"])
     linear["transition"]["hidden_sizes"] = []
@@ -85,21 +85,23 @@ def run(config: dict[str, Any]) -> int:
     found = estimates(filters, shown)
     out = Path(config["out"])
     out.mkdir(parents=True, exist_ok=True)
-    table = pd.DataFrame(rows(found, held.observation, hidden, log.names, norm.std))
+    table = pd.DataFrame(rows(found, held.observation, hidden, records.names, norm.std))
     write_table(out / "table.csv", table)
-    figure = _figure(found, held, hidden, log.names, [log.episodes[i] for i in test])
+    figure = _figure(found, held, hidden, records.names, [records.episodes[i] for i in test])
     save_figure(figure, out / "estimates.png", dpi=90, palette=True)
     weights = {f"norm.{k}": v for k, v in norm.state_dict().items()}
     weights |= {f"belief.filter.{k}": v for k, v in filters[_FILTER].state_dict().items()}
     save_file(weights, out / "filter.safetensors")
-    say(
+    log_line(
         f"{len(train)} episodes trained on, {len(validation)} to choose the epoch, {len(test)} "
         "held out; of these:"
     )
     overall = table[table["component"] == "all"].drop(columns=["component", "rmse"])
-    say(overall.to_string(index=False, float_format="%.3f", na_rep=""))
+    log_line(overall.to_string(index=False, float_format="%.3f", na_rep=""))
     start = override("belief.pretrained", out / "filter.safetensors")
-    say(f"written: {out}; an agent starts from it by belief={config['belief']['name']} {start}")
+    log_line(
+        f"written: {out}; an agent starts from it by belief={config['belief']['name']} {start}"
+    )
     return 0
 
 
@@ -119,7 +121,7 @@ def _fitted(
     belief_filter: BeliefFilter = build("belief", dict(settings), **sizes).module.filter
     how = {key: config[key] for key in _TRAINING} | {"length": config["sequence_length"]}
     history = list(fit(belief_filter, data.rows(train), data.rows(validation), **how))
-    say(
+    log_line(
         f"{name}: {max(history):.3f} nats an entry on validation episodes, epoch "
         f"{history.index(max(history)) + 1} of {len(history)}"
     )

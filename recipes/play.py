@@ -1,6 +1,6 @@
-"""Show an agent at work: ``python recipes/play.py run=<folder> point=mcar:0.5 out=film.gif``.
+"""Show an agent at work: ``python recipes/play.py run=<folder> point=mcar:0.5 out=video.gif``.
 
-The film of an episode, or the picture with ``out=belief.png``, shows the robot, which of its
+The video of an episode, or the picture with ``out=belief.png``, shows the robot, which of its
 sensors arrive at each step and, for some of them, the true value, what arrived, the gaps, and the
 belief, if there is one, with its 95 % interval.
 """
@@ -16,9 +16,9 @@ from evaluation.trained import load_trained_agent
 from rendering.belief_figure import chosen_sensors, draw_belief
 from rendering.style import save_figure
 from rendering.trajectory import record_episode
-from rendering.video import Film, robot_size, write_video
+from rendering.video import Video, robot_size, write_video
 from training.config import check_limits, check_mode, command
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 
 _LIMITS = {
@@ -42,7 +42,7 @@ def run(config: dict[str, Any]) -> int:
     text, spike_std = str(config["point"]), float(config["spike_std"])
     condition = parse_condition(text, trained.settings, spike_std=spike_std)
     still = out.suffix == ".png"
-    # Panels of the first frame of a film look back too.
+    # Panels of the first frame of a video look back too.
     begin = first if still else max(0, first - config["window"] + 1)
     seed = config["reduction_seed"]
     size = _STRIP if still else robot_size(config["size"])
@@ -75,11 +75,11 @@ def run(config: dict[str, Any]) -> int:
             what = f"the 95 % intervals hold {coverage:.1f} % of the missing entries"
     else:
         look = {"window": config["window"], "width": config["size"], "title": title}
-        film = Film(recording, sensors, steps=steps, **look)
-        write_video(out, film, fps=config["fps"], colours=config["colours"])
-        what = f"{len(film)} frames of {film.width} x {film.height}"
+        video = Video(recording, sensors, steps=steps, **look)
+        write_video(out, video, fps=config["fps"], colours=config["colours"])
+        what = f"{len(video)} frames of {video.width} x {video.height}"
     missing = 1 - recording.observed[steps.start :].mean()
-    say(
+    log_line(
         f"steps {first} to {begin + steps[-1]}, missing {missing:.3f}, {what}; written: {out} "
         f"({out.stat().st_size / 1e6:.2f} MB)"
     )

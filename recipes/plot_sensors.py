@@ -15,7 +15,7 @@ from evaluation.sensor_choice import SensorModel, learned_sensors
 from evaluation.trained import TrainedAgent, load_trained_agent
 from rendering.style import save_figure
 from training.config import check_limits, command
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 from training.run_folder import write_table
 
@@ -34,7 +34,7 @@ def run(config: dict[str, Any]) -> int:
         except UserError as error:
             if len(folders) == 1:
                 raise
-            say(f"{folder.name}: left out; {error}")
+            log_line(f"{folder.name}: left out; {error}")
     if not members:
         raise UserError("`run` must name runs that have learned H, P and R; none of these has.")
     groups: dict[str, list[SensorModel]] = {}
@@ -50,7 +50,7 @@ def run(config: dict[str, Any]) -> int:
     for name, figure in figures.items():
         save_figure(figure, out / f"{name}.png", dpi=config["dpi"], palette=True)
     runs = f"{len(members)} run{'s' if len(members) > 1 else ''}"
-    say(f"{runs}, written: {out}/sensor_ranking.png, .csv, observation_covariance.png")
+    log_line(f"{runs}, written: {out}/sensor_ranking.png, .csv, observation_covariance.png")
     return 0
 
 

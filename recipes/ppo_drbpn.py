@@ -28,7 +28,7 @@ from tqdm import tqdm
 from training.agent import add_primers, device_named, make_agent, start_from_pretrained
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint, save_checkpoint
 from training.config import build, checked, explained, one_line, run_command
-from training.console import BAR, StopRequest, say, show, stop_request
+from training.console import BAR, StopRequest, log_line, show, stop_request
 from training.envs import env_name, make_env
 from training.errors import DivergedError, EnvironmentFault, UserError
 from training.ppo import add_advantages, finished_episodes, rollout_metrics
@@ -156,14 +156,16 @@ def train(config: DictConfig, folder: Path) -> int:
                     f"trained for, got {config.total_frames:,}."
                 )
             if frames >= config.total_frames and is_evaluated(folder, config):
-                say(f"`{folder}` is at its end; more total_frames go on with it")
+                log_line(f"`{folder}` is at its end; more total_frames go on with it")
                 return 0
             if not training.keeps_simulators:
-                say(f"{env_name(config)} can't save its state here: going on with new episodes")
+                log_line(
+                    f"{env_name(config)} can't save its state here: going on with new episodes"
+                )
         log = RunLog(folder, config, list(training.agent.summary()), frames, evaluated)
         write_config(folder, config)
         write_versions(folder)
-        say(f"run folder: {folder}")
+        log_line(f"run folder: {folder}")
         _loop(training, config, folder, log, stop)
     training.collector.shutdown()
     return stop.exit_code
@@ -192,7 +194,7 @@ def _loop(
             training.evaluated_frames = training.frames
             log.evaluation(rows)
             bar.clear()
-            say(_summary(rows))
+            log_line(_summary(rows))
 
     with tqdm(
         total=config.total_frames, initial=training.frames, unit="step", unit_scale=True,
@@ -218,7 +220,7 @@ def _loop(
             if not resets and row["engine_resets"]:
                 resets = row["engine_resets"]
                 bar.clear()
-                say(
+                log_line(
                     "an engine gave up its simulation's state and reset it: that episode ended as "
                     "truncated; metrics.csv counts `engine_resets`"
                 )
@@ -229,16 +231,16 @@ def _loop(
         save()
     if training.seconds > first_seconds:
         speed = (training.frames - first) / (training.seconds - first_seconds)
-        say(f"{speed:.0f} steps/s in collection and update, start-up and evaluation excluded")
+        log_line(f"{speed:.0f} steps/s in collection and update, start-up and evaluation excluded")
     if stop and not training.frames:
-        say("stopped before the first rollout: nothing to go on with")
+        log_line("stopped before the first rollout: nothing to go on with")
     elif stop:
-        say(f"stopped and saved; continue with {override('resume', folder)}")
+        log_line(f"stopped and saved; continue with {override('resume', folder)}")
     elif episodes := config.evaluation.final_episodes:
         rows = evaluate_training(config, training, "final", episodes, lambda: bool(stop))
         if rows is not None:
             log.evaluation(rows)
-            say(_summary(rows))
+            log_line(_summary(rows))
 
 
 def _stopped(error: Exception, before: int, saved: int, folder: Path) -> UserError:
@@ -272,7 +274,7 @@ def cell(config: DictConfig, words: Sequence[str], folder: Path) -> int:
         return 0
     status = train(wanted, folder)
     if not status:
-        say(f"{folder.name}: done")
+        log_line(f"{folder.name}: done")
     return status
 
 

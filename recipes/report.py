@@ -18,7 +18,7 @@ from analysis.tables import derived_tables
 from evaluation.folders import find_folders
 from rendering.style import save_figure
 from training.config import check_limits, command
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 from training.run_folder import write_table, write_whole
 
@@ -74,7 +74,7 @@ def _write_page(folder: Path, config: dict[str, Any]) -> None:
     heading = path.read_text(encoding="utf-8").split("\n")[0][2:] if path.is_file() else folder.name
     title = config["title"] or heading
     write_whole(path, page(study, tables, drawn, title=title, notes=text, folder=folder.name))
-    say(f"{len(study.runs)} runs, written: {folder}")
+    log_line(f"{len(study.runs)} runs, written: {folder}")
 
 
 def _replace(path: Path, content: Any) -> None:

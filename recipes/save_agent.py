@@ -14,7 +14,7 @@ import pandas as pd
 from evaluation.folders import override
 from evaluation.trained import TrainedAgent, load_trained_agent, save_weights
 from training.config import command
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 from training.run_folder import load_config, read_versions, write_config, write_whole
 
@@ -37,7 +37,7 @@ def run(config: dict[str, Any]) -> int:
     write_whole(out / "evaluation.csv", table.to_csv(index=False, lineterminator="\n"))
     write_whole(out / "README.md", _card(trained, table, versions, out))
     save_weights(out, trained)
-    say(f"written: {out}")
+    log_line(f"written: {out}")
     return 0
 
 

@@ -1,8 +1,8 @@
-"""Frames for belief modules, and the two ways to run over them; see contracts.py."""
+"""Frames for belief modules, and the two ways to run over them; see suites.py."""
 
 import torch
-from contract_environments import ACTION, OBS
 from filter_problems import assert_equal
+from suite_environments import ACTION, OBS
 from tensordict import TensorDict
 from torchrl.envs import Compose
 from torchrl.modules import set_recurrent_mode
@@ -10,7 +10,7 @@ from torchrl.modules.utils import get_primers_from_module
 
 
 class BeliefFrames:
-    """What the contracts of belief modules share."""
+    """What the suites of belief modules share."""
 
     observation: str = "observation"  # where the modules read what arrived
     # How far steps and sequences may differ, as a share of the largest entry.

@@ -6,8 +6,8 @@ from functools import partial
 from types import SimpleNamespace
 from typing import NamedTuple
 
-import oracles
 import pytest
+import references
 import torch
 from small_agents import make_filter
 from torch import Tensor
@@ -88,12 +88,12 @@ def by_hand(
     )  # fmt: skip
     if model.covariance == "propagated" and jacobian is None:
         own.jacobian = model.mean_jacobian
-    data = oracles.Data(observation, observed, action, reset, mean)
-    return oracles.filter_sequence(own, data, start_cov=cov, **stored)
+    data = references.Data(observation, observed, action, reset, mean)
+    return references.filter_sequence(own, data, start_cov=cov, **stored)
 
 
 def space(system):
-    """A linear system of the oracles as the library takes it."""
+    """A linear system of the references as the library takes it."""
     return StateSpace(
         system.transition, system.transition_cov, system.matrix, system.noise, system.action_matrix,
         system.bias, system.initial_mean, system.initial_cov,
@@ -128,8 +128,10 @@ class Problem:
         dtype=torch.float64,
         propagated=False,
     ):
-        system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
-        data = oracles.simulate(system, batch, time, seed=seed, reset_rate=0.3 if resets else 0.0)
+        system = references.random_system(state, obs, seed=seed, full_noise=full_noise)
+        data = references.simulate(
+            system, batch, time, seed=seed, reset_rate=0.3 if resets else 0.0
+        )
         g = torch.Generator().manual_seed(seed + 9)
         self.full_noise, self.residual, self.activation = full_noise, residual, activation
         self.observed, self.reset = data.observed, data.reset.clone()
@@ -159,7 +161,7 @@ class Problem:
         if propagated:
             # Constants of autograd; it expands in some directions.
             self.jacobian = 1.1 * system.dynamics.to(dtype)
-            covs = [oracles.spd(state, g) for _ in range(batch * (1 + time))]
+            covs = [references.spd(state, g) for _ in range(batch * (1 + time))]
             covs = torch.stack(covs).to(dtype)
             self.start_cov = covs[:batch]
             self.stored_cov = covs[batch:].unflatten(0, (batch, time)) if stored else None
@@ -223,13 +225,13 @@ class Problem:
             noise, observed = noise + torch.diag_embed(added), observed & (self.weight > 0)
         weights, biases = self.network()
         model = SimpleNamespace(
-            transition=oracles.mean_network(weights, biases, self.residual, self.activation),
+            transition=references.mean_network(weights, biases, self.residual, self.activation),
             transition_cov=q, noise=noise, initial_cov=p, jacobian=self.jacobian,
             **{name: self.leaves[name] for name in self.plain},
         )  # fmt: skip
         start, action, x, _, reset = self.arguments()
-        data = oracles.Data(x, observed, action, reset, start)
-        out = oracles.filter_sequence(model, data, start_cov=self.start_cov, **self.stored())
+        data = references.Data(x, observed, action, reset, start)
+        out = references.filter_sequence(model, data, start_cov=self.start_cov, **self.stored())
         return out.mean, out.cov, out.log_likelihood
 
     def gradients(self, outputs):

@@ -1,7 +1,7 @@
 """A small particle filter of fixed parameters, and frames for it."""
 
 import torch
-from contracts import ACTION, OBS, BeliefModuleContract
+from suites import ACTION, OBS, BeliefModuleSuite
 
 from torchrl_drbpn import ParticleFilter
 from torchrl_drbpn.functional import ParticleNoise
@@ -19,7 +19,7 @@ def make_filter(obs=OBS, action=ACTION, dtype=None, **kwargs):
 
 
 def make_frames(shape, seed=0):
-    return BeliefModuleContract().make_frames(shape, torch.float64, seed)
+    return BeliefModuleSuite().make_frames(shape, torch.float64, seed)
 
 
 def sample_noise(shape, particles, latent, seed):

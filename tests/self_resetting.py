@@ -1,6 +1,6 @@
 """An environment that starts the next episode by itself, as TorchRL's native auto-reset ones do."""
 
-from contracts import StaircaseEnv
+from suites import StaircaseEnv
 
 __all__ = ["SelfResettingEnv"]
 

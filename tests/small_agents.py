@@ -8,7 +8,7 @@ holds both ends inside rows, and the second one begins in mid-episode.
 from dataclasses import dataclass
 
 import torch
-from contract_environments import with_belief_entries
+from suite_environments import with_belief_entries
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictSequential,

@@ -4,11 +4,11 @@ import functools
 
 import pytest
 import torch
-from contracts import ACTION, OBS, BeliefModuleContract
 from filter_problems import by_hand
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_agents import make_filter as make_any_filter
+from suites import ACTION, OBS, BeliefModuleSuite
 from tensordict import TensorDict
 from torchrl.modules import set_recurrent_mode
 
@@ -20,7 +20,7 @@ make_filter = functools.partial(make_any_filter, OBS, ACTION)
 
 
 def make_frames(shape, dtype=torch.float64, *args, **kwargs):
-    return BeliefModuleContract().make_frames(shape, dtype, *args, **kwargs)
+    return BeliefModuleSuite().make_frames(shape, dtype, *args, **kwargs)
 
 
 def with_state(frames, state):
@@ -35,7 +35,7 @@ def with_state(frames, state):
     return frames.clone().set("recurrent", recurrent)
 
 
-class TestContract(BeliefModuleContract):
+class TestSuite(BeliefModuleSuite):
     all_outputs = ("features", ("belief", "log_likelihood"), *OPTIONAL)
 
     filter, policy_input = staticmethod(make_any_filter), "mean"
@@ -48,18 +48,18 @@ class TestContract(BeliefModuleContract):
         return out["features"].square().mean() - out["belief", "log_likelihood"].mean()
 
 
-class Further(TestContract):
+class Further(TestSuite):
     test_it_runs_in_batched_environments = None  # once is enough
 
 
-class TestContractOfTheInformationForm(Further):
+class TestSuiteOfTheInformationForm(Further):
     """State smaller than obs; the covariance in the features."""
 
     filter, policy_input = staticmethod(functools.partial(make_any_filter, state=3)), "mean_cov"
     test_compiled_without_a_graph_break_equals_eager = None  # the other two do
 
 
-class TestContractOfANetworkCovariance(Further):
+class TestSuiteOfANetworkCovariance(Further):
     """Q depends on the state: the filter runs step by step."""
 
     filter = staticmethod(functools.partial(make_any_filter, state=3, cov_network=True))
@@ -68,20 +68,20 @@ class TestContractOfANetworkCovariance(Further):
 PROPAGATED = functools.partial(make_any_filter, covariance="propagated")
 
 
-class TestContractOfAPropagatedCovariance(Further):
+class TestSuiteOfAPropagatedCovariance(Further):
     """The recurrent state holds the covariance."""
 
     filter = staticmethod(PROPAGATED)
 
 
-class TestContractOfARobustUpdate(Further):
+class TestSuiteOfARobustUpdate(Further):
     """Readings are weighed by the belief of each step; most weights are under 1."""
 
     filter = staticmethod(functools.partial(PROPAGATED, robust="huber", robust_threshold=0.5))
     test_a_reading_that_is_not_usable_is_named = None  # huge ones are: test_robust_update.py
 
 
-def test_the_keys_are_those_of_the_contract_and_a_list_renames_them_by_position():
+def test_the_keys_are_those_of_the_design_and_a_list_renames_them_by_position():
     module = BeliefFilterModule(make_filter())
     four = ["observation", "observed", "previous_action", "is_init"]
     assert module.in_keys == [*four, ("recurrent", "mean"), ("recurrent", "age")]

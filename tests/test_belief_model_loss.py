@@ -1,9 +1,9 @@
-"""What `BeliefModelLoss` is held to: a loss's duties, and minus the log-likelihood, each once."""
+"""`BeliefModelLoss` meets the suite of losses, and is minus the log-likelihood, each once."""
 
 import pytest
 import torch
-from contracts import LossContract
 from refusals import refuses
+from suites import LossSuite
 from tensordict import TensorDict
 
 from torchrl_drbpn import BeliefModelLoss
@@ -47,7 +47,7 @@ def counted(data):
     return total, entries, steps
 
 
-class TestContract(LossContract):
+class TestSuite(LossSuite):
     has_networks = False
     reductions = ("none", "mean", "sum")
 

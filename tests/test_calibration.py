@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from oracles import spd
+from references import spd
 from refusals import refuses
 
 from torchrl_drbpn.functional import Belief, chi_square_quantile, consistency, innovation, nees, nis

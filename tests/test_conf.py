@@ -225,8 +225,8 @@ COMMANDS = ("evaluate", "diagnose", "export", "play", "plot_sensors", "report", 
         ("play", {"sensors": ["pole"]}, "`sensors` must be among 0 cart position, .*got 'pole'"),
         ("play", {"sensors": [4]}, "`sensors` must be among .*got 4"),
         ("play", {"sensors": 0}, "`sensors` must be 1 or more"),
-        ("play", {"out": "nowhere/film.gif"}, "`out` must lie in an existing folder"),
-        ("play", {"out": "film.avi"}, r"`out` must end in .gif, .mp4 or .png, got film.avi"),
+        ("play", {"out": "nowhere/video.gif"}, "`out` must lie in an existing folder"),
+        ("play", {"out": "video.avi"}, r"`out` must end in .gif, .mp4 or .png, got video.avi"),
         ("plot_sensors", {"run": None}, NO_RUN),
         ("plot_sensors", {"run": "nowhere/*"}, "run folders, nowhere/\\* matches none"),
         ("plot_sensors", {"run": "nowhere"}, "there is no folder nowhere"),
@@ -248,7 +248,7 @@ def test_bad_input_is_answered_with_one_line_before_anything_is_done(
 ):
     config = configured(name) | {"run": str(drbpn), "start": 0} | changes
     if "out" not in changes:
-        written = {"play": "film.gif", "export": "policy.pt2"}.get(name, "out")
+        written = {"play": "video.gif", "export": "policy.pt2"}.get(name, "out")
         config["out"] = str(tmp_path / written)
     if name == "evaluate" and "output" not in changes:
         config |= {"output": str(tmp_path / "out.csv"), "processes": changes.get("processes", 1)}

@@ -80,7 +80,7 @@ def test_every_equation_has_a_row_and_what_theory_names_exists():
         assert all(callable(resolve(name)) for name in code), numbers
         assert all(re.fullmatch(r"\w+\.py::test_\w+", test) for test in tests), tests
     text = (DOCS / "theory.md").read_text(encoding="utf-8")
-    for file, test in re.findall(r"`(test_\w+\.py|contracts\.py)::(\w+)`", text):
+    for file, test in re.findall(r"`(test_\w+\.py|suites\.py)::(\w+)`", text):
         assert test in names_of_tests(file), f"{file}::{test}"
     for name in re.findall(r"`(functional\.[\w.]+)`", text):
         assert resolve(name) is not None, name

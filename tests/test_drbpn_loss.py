@@ -1,13 +1,13 @@
-"""What `DRBPNLoss` is held to: a loss's duties, and eq. (13) [DRBPN] from one filter pass."""
+"""What `DRBPNLoss` is held to: a loss's requirements, and eq. (13) [DRBPN] from one filter pass."""
 
 import functools
 
-import oracles
 import pytest
+import references
 import torch
-from contracts import LossContract
 from refusals import refuses
 from small_agents import ACTION, OBS, TIME, add_advantages, collect, make_agent, make_filter
+from suites import LossSuite
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.modules import GRUModule, ValueOperator, set_recurrent_mode
@@ -59,7 +59,7 @@ def cut(data, length):
     return data.reshape(-1).reshape(-1, length)
 
 
-class TestContract(LossContract):
+class TestSuite(LossSuite):
     def make_loss(self, **kwargs):
         # analytic entropy: nothing is sampled in the loss
         return make_loss(make_belief_agent(torch.float32), **kwargs)
@@ -68,7 +68,7 @@ class TestContract(LossContract):
         return as_dtype(make_data(torch.float32), dtype)
 
 
-class TestContractWithoutAModel(LossContract):
+class TestSuiteWithoutAModel(LossSuite):
     """A GRU in the filter's place."""
 
     # TorchRL's GRU does not compile.
@@ -194,7 +194,7 @@ def counted(agent, data):
     """Log-likelihood of every received observation, and entries, from the row-deleting oracle."""
     model = agent.belief.filter
     f = model.transition.mean_network()
-    transition = oracles.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)
+    transition = references.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)
     H, R, Q = model.emission.matrix, model.emission.cov(), model.transition.cov()
     F = model.mean_jacobian if model.covariance == "propagated" else None
     total, entries = torch.zeros((), dtype=torch.float64), 0
@@ -204,14 +204,14 @@ def counted(agent, data):
         action = frame["previous_action"].to(torch.float64)
         offset = model.emission.action_matrix @ action + model.emission.offset
         step = (*belief, frame["observation"], frame["observed"], H, R, offset)
-        total = total + oracles.log_likelihood(*step)
+        total = total + references.log_likelihood(*step)
         entries += int(frame["observed"].sum())
-        return oracles.update(*step)
+        return references.update(*step)
 
     def move(belief, frame):
         mean, cov = belief  # what is propagated is a constant of the gradient
         action = frame["previous_action"].to(torch.float64)
-        return oracles.predict(mean, cov.detach(), transition, Q, action, F)
+        return references.predict(mean, cov.detach(), transition, Q, action, F)
 
     for row in data.unbind(0):
         belief = None

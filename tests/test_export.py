@@ -147,8 +147,8 @@ def test_a_saved_agent_acts_as_the_run_did(finished, tmp_path):
         for i, folder in enumerate((finished, out))
     ]
     assert tables[0] == [row | {"run": finished.name} for row in tables[1]]
-    film = configured("play") | {"run": str(out), "robot": False, "start": 0, "steps": 2}
-    assert play.run(film) == 0
+    video = configured("play") | {"run": str(out), "robot": False, "start": 0, "steps": 2}
+    assert play.run(video) == 0
     assert (out / "play.gif").is_file()
     card = (out / "README.md").read_text()
     for text in ("# InvertedPendulum-v5, drbpn", "mcar:0.4", "| 128 |", "| seed | 0 |", "sampled"):
@@ -164,8 +164,8 @@ def test_an_agent_of_the_repository_acts_under_this_code(folder, tmp_path):
     assert data["action"].isfinite().all()
     card = pd.read_csv(folder / "evaluation.csv").iloc[0]  # whole episodes; these only begin
     assert data["next", "reward"].mean() > 0.5 * card.return_mean / card.length_mean
-    film = {"run": str(folder), "robot": False, "start": 0, "steps": 2, "out": tmp_path / "x.gif"}
-    assert play.run(configured("play") | film) == 0
+    video = {"run": str(folder), "robot": False, "start": 0, "steps": 2, "out": tmp_path / "x.gif"}
+    assert play.run(configured("play") | video) == 0
 
 
 def test_a_run_folder_is_not_written_into_and_broken_weights_are_one_line(

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import fit as recipe
 import numpy as np
-import oracles
 import pandas as pd
 import pytest
 import recipe_tools  # finds recipes/
+import references
 import torch
 from estimation import fitting
 from estimation.fitting import Sequences, fit, hide, per_entry, run, split
@@ -26,8 +26,8 @@ SENSORS, TORQUES = [f"x{i}" for i in range(4)], ["u0", "u1"]
 
 def logged(episodes=10, time=60):
     """Noisy, incomplete readings of a linear system, each sensor in units of its own."""
-    system = oracles.random_system(3, 4, seed=1)
-    data = oracles.simulate(system, episodes, time, seed=1, missing_rate=0.3)
+    system = references.random_system(3, 4, seed=1)
+    data = references.simulate(system, episodes, time, seed=1, missing_rate=0.3)
     data.reset[:, 0] = True
     readings = torch.where(data.observed, data.observation, torch.nan)
     readings = readings * torch.tensor([1.0, 100.0, 1e-3, 1.0]).double() + 5
@@ -128,7 +128,7 @@ def test_episodes_are_split_and_every_one_is_somewhere():
 
 
 def sequences(system, batch, time, seed=3):
-    data = oracles.simulate(system, batch, time, seed=seed)
+    data = references.simulate(system, batch, time, seed=seed)
     data.reset[:, 0] = True
     data.previous_action[:, 0] = 0
     parts = (data.previous_action, data.observation, data.observed, data.reset)
@@ -136,7 +136,7 @@ def sequences(system, batch, time, seed=3):
 
 
 def test_windows_of_a_cut_are_the_sequence_and_its_padding_is_reset():
-    data = sequences(oracles.random_system(3, 4), 2, 11)
+    data = sequences(references.random_system(3, 4), 2, 11)
     windows = data.cut(4)
     assert windows.reset.shape == (6, 4)
     assert torch.equal(windows.observation.reshape(2, 12, 4)[:, :11], data.observation)
@@ -146,7 +146,7 @@ def test_windows_of_a_cut_are_the_sequence_and_its_padding_is_reset():
 
 def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself():
     """With actions in units of a thousand, which the scale must take out and put back."""
-    system = oracles.random_system(3, 4, seed=1)
+    system = references.random_system(3, 4, seed=1)
     train, held = sequences(system, 40, 64), sequences(system, 40, 64, seed=4)
     data = [x._replace(previous_action=1e3 * x.previous_action) for x in (train, held)]
     torch.manual_seed(0)
@@ -164,7 +164,7 @@ def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself():
 
 
 def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it():
-    system = oracles.random_system(3, 4, seed=1)
+    system = references.random_system(3, 4, seed=1)
     train, held = sequences(system, 2, 8), sequences(system, 20, 16, seed=4)
     torch.manual_seed(0)
     belief_filter = BeliefFilter(4, 2, 3)
@@ -179,7 +179,7 @@ def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it():
 
 
 def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(monkeypatch):
-    data = sequences(oracles.random_system(3, 4), 2, 12)
+    data = sequences(references.random_system(3, 4), 2, 12)
     torch.manual_seed(0)
     belief_filter = BeliefFilter(4, 2, 3, covariance="propagated")
     calls = []
@@ -207,7 +207,7 @@ def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(
 
 
 def test_the_weights_of_the_transition_alone_decay():
-    data = sequences(oracles.random_system(3, 4), 2, 8)
+    data = sequences(references.random_system(3, 4), 2, 8)
     belief_filter = BeliefFilter(4, 2, 3)
     options = {"length": 8, "batch_size": 2, "max_grad_norm": 1.0, "patience": 1, "seed": 0}
     list(fit(belief_filter, data, data, steps=1, lr=1e-3, weight_decay=1e3, **options))
@@ -218,7 +218,7 @@ def test_the_weights_of_the_transition_alone_decay():
 
 
 def test_the_last_value_of_a_sensor_is_what_it_showed_last_and_zero_before():
-    data = sequences(oracles.random_system(3, 4), 2, 8)
+    data = sequences(references.random_system(3, 4), 2, 8)
     found = fitting.estimates({"filter": BeliefFilter(4, 2, 3)}, data)["last value"].mean
     last = torch.zeros(2, 4)
     for t in range(8):

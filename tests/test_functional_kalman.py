@@ -2,8 +2,8 @@
 
 import math
 
-import oracles
 import pytest
+import references
 import torch
 from filter_problems import assert_equal, outputs
 
@@ -19,10 +19,10 @@ FUNCTIONS = ["innovation", "update", "log_likelihood"]
 
 def given(state, obs, *, seed=0, full_noise=True):
     """The arguments of a step, whose rows observe one entry, all, some and none; a generator."""
-    system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise)
+    system = references.random_system(state, obs, seed=seed, full_noise=full_noise)
     g = torch.Generator().manual_seed(seed + 77)
     mean = torch.randn(5, state, generator=g, dtype=torch.float64)
-    cov = torch.stack([oracles.spd(state, g) for _ in range(5)])
+    cov = torch.stack([references.spd(state, g) for _ in range(5)])
     x = 2 * torch.randn(5, obs, generator=g, dtype=torch.float64)
     offset = torch.randn(5, obs, generator=g, dtype=torch.float64)
     observed = torch.rand(5, obs, generator=g) < 0.6
@@ -45,7 +45,7 @@ def test_masking_an_entry_equals_deleting_its_row_in_values_and_gradients(state,
     cov, r = root_p @ root_p.mT, root_r @ root_r.mT
     actual = outputs(Belief(mean, cov), x, observed, h, r, offset)[2:]
     rows = [(mean[i], cov[i], x[i], observed[i], h, r, offset[i]) for i in range(len(x))]
-    each = [(*oracles.update(*row), oracles.log_likelihood(*row)) for row in rows]
+    each = [(*references.update(*row), references.log_likelihood(*row)) for row in rows]
     expected = [torch.stack(part) for part in zip(*each, strict=True)]
     weights = [torch.randn(e.shape, generator=g, dtype=torch.float64) for e in expected]
     totals = [
@@ -83,7 +83,7 @@ def test_innovation_is_the_residual_with_zeros_and_the_unmasked_covariance(state
 
 
 def test_predict_forgets_the_covariance_where_the_jacobian_is_none():
-    system = oracles.random_system(3, 4)
+    system = references.random_system(3, 4)
     (belief, *_), g = given(3, 4)
     action = torch.randn(5, 2, generator=g, dtype=torch.float64)
     q = system.transition_cov
@@ -93,7 +93,7 @@ def test_predict_forgets_the_covariance_where_the_jacobian_is_none():
     assert_equal(plain.mean, belief.mean @ system.dynamics.T + action @ system.control.T)
     assert torch.equal(plain.cov.expand_as(belief.cov), q.expand_as(belief.cov))
     # A Q and a Jacobian of each belief's own.
-    q = torch.stack([oracles.spd(3, g) for _ in range(5)])
+    q = torch.stack([references.spd(3, g) for _ in range(5)])
     j = torch.randn(5, 3, 3, generator=g, dtype=torch.float64)
     assert_equal(
         F.predict(belief, system.transition, q, action, jacobian=j).cov, j @ belief.cov @ j.mT + q
@@ -116,19 +116,19 @@ def propagated(system, x, observed, action, belief):
 def test_step_likelihoods_sum_to_one_joint_gaussian_when_the_covariance_is_propagated(
     state, obs, seed
 ):
-    system = oracles.random_system(state, obs, seed=seed, full_noise=True)
-    data = oracles.simulate(system, batch=1, time=6, seed=seed)
+    system = references.random_system(state, obs, seed=seed, full_noise=True)
+    data = references.simulate(system, batch=1, time=6, seed=seed)
     rows = data.observation[0], data.observed[0], data.previous_action[0]
     steps = propagated(system, *rows, Belief(system.initial_mean, system.initial_cov))
-    mean, prior, H, R, x = oracles.joint_gaussian(system, data, row=0)
+    mean, prior, H, R, x = references.joint_gaussian(system, data, row=0)
     joint = torch.distributions.MultivariateNormal(H @ mean, H @ prior @ H.mT + R)
     assert_equal(sum(ll for *_, ll in steps), joint.log_prob(x))
 
 
 def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagated():
-    system = oracles.random_system(3, 5, seed=4, full_noise=True)
-    data = oracles.simulate(system, batch=1, time=30, seed=4)
-    truth = oracles.statsmodels(system, data).filter()
+    system = references.random_system(3, 5, seed=4, full_noise=True)
+    data = references.simulate(system, batch=1, time=30, seed=4)
+    truth = references.statsmodels(system, data).filter()
     rows = data.observation[0], data.observed[0], data.previous_action[0]
     steps = propagated(system, *rows, Belief(system.initial_mean, system.initial_cov))
     for t, (_, filtered, ll) in enumerate(steps):
@@ -221,7 +221,7 @@ MASKS = pytest.mark.parametrize(
 def test_masked_log_density_is_that_of_the_sub_vector_and_reads_nothing_else(mask):
     g = torch.Generator().manual_seed(0)
     residual = torch.randn(3, 4, generator=g, dtype=torch.float64)
-    cov = torch.stack([oracles.spd(4, g) for _ in range(3)])
+    cov = torch.stack([references.spd(4, g) for _ in range(3)])
     rows = torch.tensor(mask).nonzero().squeeze(-1)
     expected = torch.zeros(3, dtype=torch.float64)
     if len(rows):
@@ -260,7 +260,7 @@ def test_float32_full_covariances_can_be_factorised_for_extreme_parameters():
 
 
 def test_every_full_covariance_above_the_floor_can_be_reached_by_a_lower_triangle():
-    target = oracles.spd(4, torch.Generator().manual_seed(1)) + 0.02 * torch.eye(
+    target = references.spd(4, torch.Generator().manual_seed(1)) + 0.02 * torch.eye(
         4, dtype=torch.float64
     )
     root = torch.linalg.cholesky(target - 0.01 * torch.eye(4, dtype=torch.float64))

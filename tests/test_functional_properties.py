@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 
-import oracles
+import references
 import torch
 from filter_problems import Problem, outputs
 from hypothesis import given, settings
@@ -26,7 +26,7 @@ CASES = DIMS | {
 def draw(state, obs, seed, batch, share, full_noise, dtype):
     """A predicted belief, readings, mask, H, R and offsets, as `update` takes them."""
     g = torch.Generator().manual_seed(seed)
-    system = oracles.random_system(state, obs, seed=seed, full_noise=full_noise).to(dtype)
+    system = references.random_system(state, obs, seed=seed, full_noise=full_noise).to(dtype)
     randn = functools.partial(torch.randn, *batch, generator=g, dtype=torch.float64)
     mean, root, x, offset = randn(state), randn(state, state), 2 * randn(obs), randn(obs)
     cov = root @ root.mT / state + 0.3 * torch.eye(state)
@@ -46,7 +46,7 @@ def assert_near(actual, expected, dtype=torch.float64):
 def test_every_member_of_a_batch_is_the_row_deleting_oracle(**case):
     ((mean, cov), x, observed, h, r, offset), g = draw(**case)
     state, obs, batch, dtype = (case[name] for name in ("state", "obs", "batch", "dtype"))
-    system = oracles.random_system(state, obs, seed=case["seed"]).to(dtype)
+    system = references.random_system(state, obs, seed=case["seed"]).to(dtype)
     action = torch.randn(*batch, 2, generator=g, dtype=dtype)
     moves = system.transition, system.transition_cov
     predicted = F.predict(Belief(mean, cov), *moves, action, jacobian=system.dynamics)
@@ -59,9 +59,9 @@ def test_every_member_of_a_batch_is_the_row_deleting_oracle(**case):
     moves = system.transition, system.transition_cov
     for i in itertools.product(*map(range, batch)):
         m, p, a, reading, d = (t[i] for t in wide)
-        belief = oracles.predict(m, p, *moves, a, system.dynamics)
+        belief = references.predict(m, p, *moves, a, system.dynamics)
         step = (*belief, reading, observed[i], h.double(), r.double(), d)
-        expected = (*belief, *oracles.update(*step), oracles.log_likelihood(*step))
+        expected = (*belief, *references.update(*step), references.log_likelihood(*step))
         assert_near([t[i] for t in (*predicted, *found[2:])], expected, dtype)
 
 

@@ -2,8 +2,8 @@
 
 import math
 
-import oracles
 import pytest
+import references
 import torch
 from filter_problems import Problem, assert_equal, sequences, space
 
@@ -12,8 +12,8 @@ from torchrl_drbpn.functional import Belief, forecast, row_jacobian, smooth_sequ
 
 
 def linear(time=7, *, batch=3, reset_rate=0.3, seed=0):
-    system = oracles.random_system(3, 4, seed=seed, full_noise=True)
-    data = oracles.simulate(system, batch, time, seed=seed, reset_rate=reset_rate)
+    system = references.random_system(3, 4, seed=seed, full_noise=True)
+    data = references.simulate(system, batch, time, seed=seed, reset_rate=reset_rate)
     data.reset[:, 0] = True
     return system, data
 
@@ -26,7 +26,7 @@ def inputs(data, rows=slice(None), steps=slice(None)):
 def joint_posterior(system, data, row):
     """All states of a row given all its readings, by conditioning one joint Gaussian."""
     time, s = data.reset.shape[1], system.state_dim
-    mean, prior, H, R, x = oracles.joint_gaussian(system, data, row)
+    mean, prior, H, R, x = references.joint_gaussian(system, data, row)
     gain = torch.linalg.solve(H @ prior @ H.mT + R, H @ prior).mT
     mean = mean + gain @ (x - H @ mean)
     cov = (prior - gain @ H @ prior).reshape(time, s, time, s)
@@ -45,7 +45,7 @@ def test_it_is_the_joint_gaussian_conditioned_on_all_readings_with_its_gradients
     leaves = {name: value.clone().requires_grad_() for name, value in leaves.items()}
     roots = ("noise", "transition_cov", "initial_cov")
     fields = {n: v @ v.mT if n in roots else v for n, v in leaves.items()}
-    system = oracles.replace(system, **fields)
+    system = references.replace(system, **fields)
     found = smooth_sequence(space(system), *inputs(data))
     truth = [joint_posterior(system, data, row) for row in range(3)]
     truth = Belief(*(torch.stack(part) for part in zip(*truth, strict=True)))
@@ -65,7 +65,7 @@ def textbook(problem, row, jacobian):
     q, p, r = problem.covs()
     leaf, model = problem.leaves, problem.model()
     weights, biases = problem.network()
-    f = oracles.mean_network(weights, biases, problem.residual, problem.activation)
+    f = references.mean_network(weights, biases, problem.residual, problem.activation)
     noise = r if problem.full_noise else torch.diag(r)
     m, P, steps = leaf["start_mean"][row], torch.zeros_like(q), []
     for t in range(problem.reset.shape[1]):
@@ -75,7 +75,7 @@ def textbook(problem, row, jacobian):
             F = torch.autograd.functional.jacobian(lambda s, a=a: f(s, a), m, create_graph=True)
         first = bool(problem.reset[row, t])
         mp, Pp = (leaf["initial_mean"], p) if first else (f(m, a), F @ P @ F.mT + q)
-        m, P = oracles.update(
+        m, P = references.update(
             mp, Pp, leaf["observation"][row, t], problem.observed[row, t], leaf["matrix"], noise,
             model.offset(a),
         )  # fmt: skip
@@ -144,7 +144,7 @@ def test_a_nan_under_a_false_mask_or_before_an_episode_start_changes_nothing():
 def test_float32_covariances_stay_positive_definite_at_the_noise_floor(expands):
     system, data = linear(120, batch=1, reset_rate=0.0)
     data.observed[:, 2:-3] &= expands < 1  # where it expands, it is lost until the last three
-    system = oracles.replace(
+    system = references.replace(
         system, noise=1e-4 * torch.eye(4), transition_cov=1e-6 * torch.eye(3),
         dynamics=expands / 0.9 * system.dynamics,
     ).to(torch.float32)  # fmt: skip

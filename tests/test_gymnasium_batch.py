@@ -9,9 +9,9 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from contracts import parallel_env, saved
 from env_tools import MARKS, TASKS, play, random_actions
 from gymnasium import spaces
+from suites import parallel_env, saved
 from torchrl.envs import check_env_specs
 
 from torchrl_drbpn import GymnasiumBatchEnv, SimulatorError

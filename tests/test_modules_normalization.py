@@ -5,8 +5,8 @@ import functools
 
 import pytest
 import torch
-from contracts import saved
 from refusals import refuses
+from suites import saved
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import MultiSyncCollector

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from contracts import ACTION, OBS, BeliefModuleContract
 from particle_tools import HIDDEN, LATENT, OPTIONAL, K, make_filter, make_frames, sample_noise
 from refusals import refuses
+from suites import ACTION, OBS, BeliefModuleSuite
 from torch.distributions import Normal
 from torchrl.modules import set_recurrent_mode
 
@@ -171,7 +171,7 @@ def test_the_noise_is_normal_uniform_and_uncorrelated():
     assert ordered[-1] < 1
 
 
-class TestContract(BeliefModuleContract):
+class TestSuite(BeliefModuleSuite):
     all_outputs = ("features", ("belief", "log_likelihood"), *OPTIONAL)
 
     def make_module(self, obs=OBS, action=ACTION, dtype=None, **kwargs):

@@ -1,4 +1,4 @@
-"""Films and pictures of an agent at work."""
+"""Videos and pictures of an agent at work."""
 
 import dataclasses
 import importlib.util
@@ -18,7 +18,7 @@ from recipe_tools import refused
 from rendering import trajectory
 from rendering.belief_figure import ABSENT, BELIEF, MISSING, chosen_sensors
 from rendering.trajectory import Camera, record_episode
-from rendering.video import Film, write_video
+from rendering.video import Video, write_video
 
 # Small, and without the robot: rendering needs what a machine may lack.
 SMALL = {"start": 0, "steps": 6, "sensors": 2, "window": 4, "size": 240, "robot": False, "seed": 4}
@@ -48,16 +48,16 @@ def near(pixels, colour, tolerance=25):
     return np.abs(pixels.astype(float) - 255 * np.array(to_rgb(colour))).max(-1) < tolerance
 
 
-def make_film(recording, **changes):
+def make_video(recording, **changes):
     options = {"steps": range(len(recording.steps)), "window": 4, "width": 640, "title": "x"}
-    return Film(recording, [0, 1], **options | changes)
+    return Video(recording, [0, 1], **options | changes)
 
 
-def pixels_of(film, panel, row, window=4):
+def pixels_of(video, panel, row, window=4):
     """Row and columns of the middles of the steps of a panel, at a share of its height."""
-    box = film.axes[panel].get_window_extent()
+    box = video.axes[panel].get_window_extent()
     columns = box.x0 + box.width * (np.arange(window) + 0.5) / window
-    return int(film.height - box.y1 + row * box.height), columns.astype(int)
+    return int(video.height - box.y1 + row * box.height), columns.astype(int)
 
 
 def test_a_recording_is_the_first_episode_of_an_evaluation(drbpn, tmp_path):
@@ -102,7 +102,7 @@ def test_the_sensors_that_miss_most_are_chosen_in_the_order_of_the_observation(r
 
 
 def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(drbpn, tmp_path, capsys):
-    out, again = tmp_path / "film.gif", tmp_path / "again.gif"
+    out, again = tmp_path / "video.gif", tmp_path / "again.gif"
     for path in (out, again):
         assert show(drbpn, path, point="mcar:0.5", steps=5, every=2, fps=25, size=321) == 0
     with Image.open(out) as video:
@@ -115,13 +115,13 @@ def test_a_gif_has_the_frames_the_size_and_the_pace_that_were_asked_for(drbpn, t
     assert "3 frames of 320 x 200; written" in said
 
 
-def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path):
+def test_a_video_that_breaks_off_leaves_what_was_there(tmp_path):
     class Broken(list):
         def __iter__(self):
             yield self[0]
             raise RuntimeError("the light went out")
 
-    out = tmp_path / "film.gif"
+    out = tmp_path / "video.gif"
     out.write_bytes(b"before")
     frames = Broken([np.zeros((8, 8, 3), dtype=np.uint8), np.full((8, 8, 3), 9, dtype=np.uint8)])
     with pytest.raises(RuntimeError, match="the light went out"):
@@ -133,7 +133,7 @@ def test_a_film_that_breaks_off_leaves_what_was_there(tmp_path):
 def test_an_mp4_has_the_frames_and_the_size_that_were_asked_for(drbpn, tmp_path):
     import imageio_ffmpeg as ffmpeg
 
-    out = tmp_path / "film.mp4"
+    out = tmp_path / "video.mp4"
     assert show(drbpn, out, size=242, fps=30, steps=4) == 0
     # Two even sides, neither a multiple of 16.
     about, *frames = ffmpeg.read_frames(str(out))
@@ -155,28 +155,28 @@ def test_a_frame_shows_masks_and_gaps_up_to_its_step_and_nothing_after(recording
     sensor = int((~recording.observed).sum(0).argmax())
     # No band: it may reach over the shading.
     plain = dataclasses.replace(recording, std=np.zeros((6, 4)))
-    film = Film(plain, [sensor], steps=range(6), window=4, width=640, title="x")
+    video = Video(plain, [sensor], steps=range(6), window=4, width=640, title="x")
     for index in (5, 3, 0):  # in any order
-        frame, steps = film[index], np.arange(index - 3, index + 1)
+        frame, steps = video[index], np.arange(index - 3, index + 1)
         known = steps >= 0
         for each in range(4):
-            row, columns = pixels_of(film, 0, (each + 0.5) / 4)
+            row, columns = pixels_of(video, 0, (each + 0.5) / 4)
             missing = known & ~recording.observed[np.maximum(steps, 0), each]
             np.testing.assert_array_equal(near(frame[row, columns], ABSENT), missing)
         # Just under the upper edge, where no line runs.
-        row, columns = pixels_of(film, 1, 0.03)
+        row, columns = pixels_of(video, 1, 0.03)
         missing = known & ~recording.observed[np.maximum(steps, 0), sensor]
         np.testing.assert_array_equal(near(frame[row, columns], MISSING, 8), missing)
-    np.testing.assert_array_equal(film[0], film[:][0])
+    np.testing.assert_array_equal(video[0], video[:][0])
     with pytest.raises(IndexError):
-        film[6]
+        video[6]
 
 
 def test_the_robot_of_each_step_is_in_its_frame(recording):
     greens = [np.full((160, 115, 3), (0, 150 + 20 * i, 0), dtype=np.uint8) for i in range(6)]
-    film = make_film(dataclasses.replace(recording, pictures=greens))
+    video = make_video(dataclasses.replace(recording, pictures=greens))
     for index in (0, 4):
-        assert (film[index] == greens[index][0, 0]).all(-1).sum() > 10_000
+        assert (video[index] == greens[index][0, 0]).all(-1).sum() > 10_000
 
 
 def test_the_robot_is_drawn_where_this_machine_can_and_else_one_line_says_why(
@@ -233,22 +233,22 @@ def test_another_belief_shows_what_it_says_and_no_more(
     assert recording.kind == kind
     assert np.isfinite(recording.std).all() == has_interval
     assert np.isfinite(recording.estimate).all() == (kind != "nothing")
-    assert near(make_film(recording)[-1], BELIEF, 60).any() == (kind != "nothing")
+    assert near(make_video(recording)[-1], BELIEF, 60).any() == (kind != "nothing")
     assert show(other, tmp_path / "belief.png", steps=2) == 0
 
 
 def test_an_episode_that_ends_inside_the_window_before_the_start_is_refused(drbpn):
     length = len(record(drbpn, steps=100_000).steps)
     with refused(f"`start` must lie .* after {length} steps"):
-        show(drbpn, drbpn / "film.gif", point="mcar:0.5", start=length + 2, window=10)
+        show(drbpn, drbpn / "video.gif", point="mcar:0.5", start=length + 2, window=10)
 
 
 def test_an_mp4_without_its_package_is_refused_before_anything_is_done(
     drbpn, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None)
-    with refused(r"needs imageio-ffmpeg: .* film.gif"):
-        show(drbpn, tmp_path / "film.mp4")
+    with refused(r"needs imageio-ffmpeg: .* video.gif"):
+        show(drbpn, tmp_path / "video.mp4")
     assert not list(tmp_path.iterdir())
 
 

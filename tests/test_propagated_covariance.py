@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-import oracles
 import pytest
+import references
 import torch
 from filter_problems import TOLERANCE, Problem, assert_equal, by_hand, sequences, space
 from torch import nn
@@ -23,7 +23,7 @@ from torchrl_drbpn.functional import (
 @pytest.mark.parametrize("obs", [3, 6], ids=["innovation", "information"])
 def test_float32_stays_positive_definite_over_ten_thousand_steps(obs, expands, form):
     g = torch.Generator().manual_seed(0)
-    system = oracles.random_system(4, obs).to(torch.float32)
+    system = references.random_system(4, obs).to(torch.float32)
     weight = torch.cat([system.dynamics, system.control], 1)
     model = replace(
         space(system),

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import recipe_tools
 import torch
-from contracts import saved
 from evaluation.trained import evaluate_training
 from ppo_drbpn import collect, train_rollout
 from recipe_tools import SMOKE, assembled, assert_same_run, differences, read_table, refused, run
+from suites import saved
 from tqdm import tqdm
 from training.checkpoint import last_checkpoint
 from training.config import new_folder

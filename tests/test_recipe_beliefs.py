@@ -9,10 +9,10 @@ import functools
 import pytest
 import recipe_tools
 import torch
-from contracts import ACTION, OBS, RecipeBeliefContract, saved
 from evaluation.trained import load_trained_agent
 from ppo_drbpn import train_rollout
 from recipe_tools import BELIEFS, assembled, differences, make_config, read_table, refused, run
+from suites import ACTION, OBS, RecipeBeliefSuite, saved
 from torchrl.modules import set_recurrent_mode
 from training.config import build
 from training.envs import make_env
@@ -34,7 +34,7 @@ def settings_of(name):
     return make_config(*f"belief={name}".split()).belief
 
 
-class TestEveryBelief(RecipeBeliefContract):
+class TestEveryBelief(RecipeBeliefSuite):
     @pytest.fixture(autouse=True, params=[*BELIEFS, *FURTHER])
     def _name(self, request):
         self.name = request.param

@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 import torch
-from contract_environments import ACTION, OBS, StaircaseEnv
 from ppo_drbpn import train_rollout
 from recipe_tools import SMOKE, TABLES, assembled, differences, read_table, refused, resume, run
+from suite_environments import ACTION, OBS, StaircaseEnv
 from torchrl.data import Binary, Bounded
 from torchrl.envs import GymEnv
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint

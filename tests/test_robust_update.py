@@ -4,8 +4,8 @@ import math
 import statistics
 from typing import get_args
 
-import oracles
 import pytest
+import references
 import torch
 from filter_problems import by_hand, make_model, sequences
 from torch import nn
@@ -125,8 +125,8 @@ def correlated(off, robust, n=5, c=3.0):
     if robust is not None:
         w = innovation_weights(x, S, r, everything, robust, c)
     start = torch.zeros(1).double(), torch.eye(1).double()
-    mean, cov = oracles.update(*start, x, everything, one, (r / w).diag())
-    return w, mean, cov, oracles.update(*start, x, right, one, r.diag())[0]
+    mean, cov = references.update(*start, x, everything, one, (r / w).diag())
+    return w, mean, cov, references.update(*start, x, right, one, r.diag())[0]
 
 
 @pytest.mark.parametrize("robust", KINDS)

@@ -2,8 +2,8 @@
 
 from functools import partial
 
-import oracles
 import pytest
+import references
 import torch
 from refusals import refuses
 
@@ -36,8 +36,12 @@ def problem(seed, obs=7, state=4, full=False):
     """A random sensor model: H, P full, R diagonal or full."""
     g = torch.Generator().manual_seed(seed)
     H = torch.randn(obs, state, generator=g, dtype=DOUBLE)
-    R = oracles.spd(obs, g) if full else (0.05 + torch.rand(obs, generator=g, dtype=DOUBLE)).diag()
-    return H, oracles.spd(state, g), R
+    R = (
+        references.spd(obs, g)
+        if full
+        else (0.05 + torch.rand(obs, generator=g, dtype=DOUBLE)).diag()
+    )
+    return H, references.spd(state, g), R
 
 
 SHAPES = [pytest.param(6, 3, id="obs>state"), pytest.param(4, 6, id="obs<state")]

@@ -3,8 +3,8 @@
 import functools
 import itertools
 
-import oracles
 import pytest
+import references
 import torch
 from refusals import refuses
 
@@ -77,7 +77,7 @@ def test_the_mean_is_the_network_of_mean_and_action(residual, activation, hidden
     mean, action = inputs((2, 3))
     weights = [layer.weight for layer in transition.layers]
     biases = [layer.bias for layer in transition.layers]
-    expected = oracles.mean_network(weights, biases, residual, activation)(mean, action)
+    expected = references.mean_network(weights, biases, residual, activation)(mean, action)
     torch.testing.assert_close(transition(mean, action).mean, expected, rtol=1e-12, atol=1e-12)
 
 

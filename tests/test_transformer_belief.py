@@ -4,7 +4,7 @@ import pytest
 import torch
 from belief_frames import BeliefFrames
 from beliefs.transformer import MemoryAttention
-from contract_environments import ACTION, OBS
+from suite_environments import ACTION, OBS
 from torch import nn
 from torchrl.modules import set_recurrent_mode
 from training.config import build, choice

@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 import torch
-from contracts import ACTION, OBS, StaircaseEnv, staircase
-from contracts import vectors as data
 from refusals import refuses
+from suites import ACTION, OBS, StaircaseEnv, staircase
+from suites import vectors as data
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv

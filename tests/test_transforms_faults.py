@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
-from contracts import ACTION, OBS, staircase, vectors
 from refusals import refuses
+from suites import ACTION, OBS, staircase, vectors
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import StepCounter

@@ -4,8 +4,8 @@ from functools import partial
 
 import pytest
 import torch
-from contracts import StaircaseEnv
 from self_resetting import SelfResettingEnv
+from suites import StaircaseEnv
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite
 from torchrl.envs import ActionScaling, Compose, GymEnv, SerialEnv, Transform, TransformedEnv

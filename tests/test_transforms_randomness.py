@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from contracts import ACTION, OBS, gym_env, saved, staircase
-from contracts import vectors as data
+from suites import ACTION, OBS, gym_env, saved, staircase
+from suites import vectors as data
 from tensordict import TensorDict
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from transform_cases import CASES, COMPLETE

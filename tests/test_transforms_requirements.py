@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from contracts import ACTION, OBS, StaircaseEnv, gym_env, parallel_env, saved
+from suites import ACTION, OBS, StaircaseEnv, gym_env, parallel_env, saved
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn

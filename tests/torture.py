@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 from recipe_tools import DAMAGED, LAST, ROOT, damage, make_config, resume, run, unequal
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 
 SMALL = ("experiment=smoke", "total_frames=768", "checkpoint.every_frames=128",
@@ -134,7 +134,7 @@ def kills(work, draw, count):
         wrong += [f"{name}: {line}" for line in different + left]
         progress(f"kills: {name}: {share}, {len(wrong)} wrong so far")
     told = ", ".join(f"{n} {stage}" for stage, n in sorted(stages.items()))
-    say(
+    log_line(
         f"kills: {count} in {len(cases)} runs ({told}); runs unlike the one not killed: "
         f"{len({line.split(':')[0] for line in wrong})}"
     )
@@ -171,7 +171,7 @@ def sweep(work, draw, count):
     wrong = [] if status == 0 else [f"the sweep ended with status {status}"]
     for cell in cells:
         wrong += [f"{cell}: {line}" for line in unequal(straight / cell, killed / cell)]
-    say(
+    log_line(
         f"sweep: {count} kills of {len(cells)} cells; cells unlike those not killed: "
         f"{len({line.split(':')[0] for line in wrong})}"
     )
@@ -204,7 +204,7 @@ def full_disk(work, draw, count):
         wrong += [f"limit {limit}: {line}" for line in unequal(straight, folder)]
         shutil.rmtree(folder)
         progress(f"full disk: {number + 1} of {count}, {len(wrong)} wrong so far")
-    say(
+    log_line(
         f"full disk: {refused} of {count} ended in one line; went on unlike the one that had "
         f"room: {len(wrong) - (count - refused)}"
     )
@@ -235,7 +235,7 @@ def flipped_bits(work, draw, count):
                 loaded[with_sum] += 1
                 if with_sum:
                     wrong.append(f"bit {place} was loaded")
-    say(
+    log_line(
         f"flipped bits: {count - loaded[True]} of {count} refused, with the sum beside it; "
         f"by the archive's own sums {count - loaded[False]} of {count}"
     )
@@ -287,7 +287,7 @@ def planted(work, draw, count):
             refused += good
             wrong += [] if good else [f"{name}: status {status}\n{process.log.read_text()[-800:]}"]
         progress(f"planted: {name}, {len(wrong)} wrong so far")
-    say(
+    log_line(
         f"planted files: {refused} of {len(harmful)} refused in one line, "
         f"{ignored} of {len(harmless)} without effect"
     )
@@ -321,7 +321,7 @@ def main():
             draw = random.Random(f"{words.seed} {name}")
             found = torment(Path(work), draw, few if words.quick else many)
         for line in found:
-            say(f"WRONG {name}: {line}")
+            log_line(f"WRONG {name}: {line}")
         wrong += found
     return int(bool(wrong))
 

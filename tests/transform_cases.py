@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import torch
-from contracts import ACTION, OBS
+from suites import ACTION, OBS
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, Transform, TransformedEnv
 

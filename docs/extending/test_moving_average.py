@@ -1,10 +1,10 @@
-"""The moving average meets the duties of every belief module of a recipe."""
+"""The moving average meets the requirements of every belief module of a recipe."""
 
-from contracts import ACTION, OBS, RecipeBeliefContract
 from moving_average import build
+from suites import ACTION, OBS, RecipeBeliefSuite
 
 
-class TestMovingAverage(RecipeBeliefContract):
+class TestMovingAverage(RecipeBeliefSuite):
     """Inherit the tests; say how the belief is made."""
 
     def make_belief(self, obs: int = OBS, action: int = ACTION):

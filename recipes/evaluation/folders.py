@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from training.console import say
+from training.console import log_line
 from training.errors import UserError
 
 
@@ -38,7 +38,7 @@ def with_checkpoint(folders: Sequence[Path]) -> list[Path]:
     found = [folder for folder in folders if any(any(folder.glob(kind)) for kind in kinds)]
     for folder in folders if found else ():
         if folder not in found:
-            say(f"{folder.name}: left out, it has no checkpoint yet")
+            log_line(f"{folder.name}: left out, it has no checkpoint yet")
     return found or list(folders)
 
 

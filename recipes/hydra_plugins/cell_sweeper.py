@@ -19,7 +19,7 @@ from hydra.core.utils import JobReturn
 from omegaconf import DictConfig, OmegaConf
 from training.checkpoint import checkpoint_frames
 from training.config import EXPECTED, explain, leaves, one_line
-from training.console import STOP_FILE, say, stop_request
+from training.console import STOP_FILE, log_line, stop_request
 from training.errors import UserError
 from training.run_folder import MAY_CHANGE, is_evaluated, load_config, locked
 
@@ -65,9 +65,9 @@ def continued(config: DictConfig, folder: Path) -> DictConfig | None:
             (folder / "config.yaml").unlink()  # killed before its first checkpoint
             return config
         if frames >= config.total_frames and is_evaluated(folder, config):
-            say(f"{folder.name}: done already, left as it is")
+            log_line(f"{folder.name}: done already, left as it is")
             return None
-    say(f"{folder.name}: going on at {frames:,} steps")
+    log_line(f"{folder.name}: going on at {frames:,} steps")
     config.resume = str(folder)
     return config
 
@@ -128,11 +128,11 @@ def run_sweep(sweep: Callable[[], Sequence[Sequence[JobReturn]]], folder: Path, 
         file.unlink(missing_ok=True)
     results = [result.return_value for batch in batches for result in batch]
     lacking = {name: line for name, line in results if line}
-    say(f"{len(results) - len(lacking)} of {len(results)} cells are done: {folder}")
+    log_line(f"{len(results) - len(lacking)} of {len(results)} cells are done: {folder}")
     for name, line in lacking.items():
-        say(f"stopped: {name}" if line == STOPPED else f"failed: {name}: {line}")
+        log_line(f"stopped: {name}" if line == STOPPED else f"failed: {name}: {line}")
     if stop:
-        say("stopped and saved; the same command goes on")
+        log_line("stopped and saved; the same command goes on")
         sys.exit(stop.exit_code)
     if lacking:
         sys.exit(_FAILED)

@@ -1,1 +1,1 @@
-"""Films and pictures of an agent and its belief."""
+"""Videos and pictures of an agent and its belief."""

@@ -59,7 +59,7 @@ def draw_belief(
 
 
 def draw_panels(axes: Sequence[Any], recording: Recording, sensors: Sequence[int]) -> None:
-    """Draw the mask of all sensors, then a panel a sensor: truth, arrivals, gaps and belief."""
+    """Draw the mask of all sensors, then a panel a sensor: truth, readings, gaps and belief."""
     count, steps = len(recording.names), recording.steps
     edges = (steps[0] - 0.5, steps[-1] + 0.5)
     cells: Any = {"aspect": "auto", "interpolation": "nearest"}

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from training.config import one_line
-from training.console import say
+from training.console import log_line
 from training.envs import env_name
 from training.errors import UserError
 
@@ -143,7 +143,9 @@ def record_episode(
                 camera = camera or Camera(task, picture_size)
                 pictures.append(camera.picture(env.base_env.envs[0].unwrapped))
             except Exception as error:  # each OpenGL back end fails in its own way
-                say(f"no pictures of the robot, off-screen rendering failed: {one_line(error)}")
+                log_line(
+                    f"no pictures of the robot, off-screen rendering failed: {one_line(error)}"
+                )
                 picture_size = None
         return observing(data)
 

@@ -1,4 +1,4 @@
-"""The film of an agent at work: the robot, its sensors, what is missing, and the belief.
+"""The video of an agent at work: the robot, its sensors, what is missing, and the belief.
 
 TorchRL's PixelRenderTransform draws an observation before the agent has read it, when the belief of
 that step is not there yet: an episode is recorded first and drawn afterwards.
@@ -22,7 +22,7 @@ from rendering.trajectory import Picture, Recording
 
 _PALETTE_FRAMES = 8  # from as many frames the colours of a GIF are taken
 _INCHES = (6.4, 4.0)
-_ROBOT = (0.0, 0.12, 0.36, 0.8)  # left, bottom, width and height, in parts of the film
+_ROBOT = (0.0, 0.12, 0.36, 0.8)  # left, bottom, width and height, in parts of the video
 _SMALL: dict[str, Any] = {
     "font.size": 7.5,
     "axes.titlesize": 7.5,
@@ -32,18 +32,18 @@ _SMALL: dict[str, Any] = {
 }
 
 
-def film_size(width: int) -> tuple[int, int]:
-    """Return width and height of a film, pixels, both even: video codecs take no others."""
+def video_size(width: int) -> tuple[int, int]:
+    """Return width and height of a video, pixels, both even: video codecs take no others."""
     return 2 * (width // 2), 2 * round(width * _INCHES[1] / _INCHES[0] / 2)
 
 
 def robot_size(width: int) -> tuple[int, int]:
-    """Return width and height of the robot's pictures in a film of a width, pixels."""
-    across, upward = film_size(width)
+    """Return width and height of the robot's pictures in a video of a width, pixels."""
+    across, upward = video_size(width)
     return round(_ROBOT[2] * across), round(_ROBOT[3] * upward)
 
 
-class Film(Sequence[Picture]):
+class Video(Sequence[Picture]):
     """Frames of an episode, each drawn when it is asked for.
 
     The panels are drawn once; a frame, one for each index of the recording in ``steps``, shows the
@@ -61,7 +61,7 @@ class Film(Sequence[Picture]):
         title: str,
     ) -> None:
         self.recording, self.steps, self.window = recording, list(steps), window
-        self.width, self.height = film_size(width)
+        self.width, self.height = video_size(width)
         with mpl.rc_context(STYLE | _SMALL):
             dpi = width / _INCHES[0]
             # A canvas rounds down: the hundredth keeps it from losing a pixel.

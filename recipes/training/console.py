@@ -15,7 +15,7 @@ from tqdm import tqdm
 STOP_FILE = "TORCHRL_DRBPN_STOP_FILE"
 
 
-def say(text: str) -> None:
+def log_line(text: str) -> None:
     """Print a line; nobody has to be listening."""
     try:
         sys.stdout.write(text + "\n")

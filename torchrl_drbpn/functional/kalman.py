@@ -295,9 +295,10 @@ def update_by_mask(
     ratio = torch.exp(-0.5 * (t.square() + LOG_2PI) - log_absent)
     g = -b / spread * ratio
     h = (b / spread).square() * ratio * (ratio + t)
-    telling = ~observed & (variance * h > _LEAST_INFORMATION)
-    h = torch.where(telling, h, 1.0 / (2.0 * variance))  # no division by 0 where nothing is told
+    informative = ~observed & (variance * h > _LEAST_INFORMATION)
+    # No division by 0 where the absence says nothing.
+    h = torch.where(informative, h, 1.0 / (2.0 * variance))
     reading = mean + g / h
     extra = torch.diag_embed(1.0 / h - variance)
-    told = update(belief, reading, telling, emission_matrix, noise + extra, offset)
-    return told, log_mask.to(belief.mean.dtype)
+    after = update(belief, reading, informative, emission_matrix, noise + extra, offset)
+    return after, log_mask.to(belief.mean.dtype)

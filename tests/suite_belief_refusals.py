@@ -1,9 +1,9 @@
-"""What every belief module refuses, by name; see contracts.py."""
+"""What every belief module refuses, by name; see suites.py."""
 
 import pytest
 import torch
 from belief_frames import BeliefFrames
-from contract_environments import ACTION, OBS
+from suite_environments import ACTION, OBS
 from torchrl.modules import set_recurrent_mode
 
 

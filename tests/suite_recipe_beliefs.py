@@ -1,10 +1,10 @@
-"""Duties of every belief module of a recipe; see contracts.py."""
+"""Requirements of every belief module of a recipe; see suites.py."""
 
 import pytest
 import small_agents
 import torch
 from belief_frames import BeliefFrames
-from contract_environments import ACTION, OBS, StaircaseEnv
+from suite_environments import ACTION, OBS, StaircaseEnv
 from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -16,8 +16,8 @@ from torchrl_drbpn.transforms import ObservationMissingness, ObservationNoise, P
 LOG_LIKELIHOOD = ("belief", "log_likelihood")
 
 
-class RecipeBeliefContract(BeliefFrames):
-    """Duties of what a builder under recipes/beliefs returns, with or without memory or model."""
+class RecipeBeliefSuite(BeliefFrames):
+    """Requirements of what a builder under recipes/beliefs returns."""
 
     observation = "normalized_observation"
 

@@ -1,4 +1,4 @@
-"""Environments and helpers that the contracts share; see contracts.py."""
+"""Environments and helpers that the suites share; see suites.py."""
 
 import copy
 import io

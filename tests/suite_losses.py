@@ -1,14 +1,14 @@
-"""Duties of every loss; see contracts.py."""
+"""Requirements of every loss; see suites.py."""
 
 import copy
 
 import pytest
 import torch
-from contract_environments import heirs
+from suite_environments import heirs
 
 
-class LossContract:
-    """Duties of a loss: what a TorchRL LossModule promises."""
+class LossSuite:
+    """Requirements of a loss: what a TorchRL LossModule promises."""
 
     has_networks = True
     reductions = ()  # that the constructor takes; none where held losses decide

@@ -1,12 +1,12 @@
-"""Requirements of every belief module; see contracts.py."""
+"""Requirements of every belief module; see suites.py."""
 
 import warnings
 from functools import partial
 
 import pytest
 import torch
-from contract_belief_refusals import BeliefModuleRefusals
-from contract_environments import (
+from suite_belief_refusals import BeliefModuleRefusals
+from suite_environments import (
     ACTION,
     OBS,
     StaircaseEnv,
@@ -25,7 +25,7 @@ from torchrl.modules.utils import get_primers_from_module
 from torchrl_drbpn import GymnasiumBatchEnv
 
 
-class BeliefModuleContract(BeliefModuleRefusals):
+class BeliefModuleSuite(BeliefModuleRefusals):
     """What `GRUModule` does in a TorchRL pipeline, and the age rule.
 
     One step at a time `is_init` starts from the module's initial state. Over time `is_init & (age
