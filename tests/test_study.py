@@ -181,7 +181,7 @@ def test_what_fails_ends_no_other_and_launchers_run_the_same_cells_to_the_same_b
         assert answer.returncode == 1, answer.stderr
         assert "\n1 of 3 cells are done: out\n" in "\n" + answer.stdout
         failed = re.findall(r"^failed: \S+: (.*)$", answer.stdout, re.MULTILINE)
-        assert [line.split(" ")[0] for line in failed] == ["training", "`optim`:"]
+        assert [line.split(" ")[0] for line in failed] == ["training", "`optim.lr`"]
         assert launcher != "joblib" or "Done   3 out of   3" in answer.stderr
         (made[launcher],) = (tmp_path / launcher / "out").glob("*lr-0.001*")
     first = load_checkpoint(last_checkpoint(made.pop("basic")))
