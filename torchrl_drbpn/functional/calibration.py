@@ -36,7 +36,8 @@ def nis(innovation: Tensor, innovation_cov: Tensor, observed: Tensor) -> Tensor:
         1.0
     """
     check_observed(innovation, observed)
-    return nees(zero_missing(innovation, observed), masked_cov(innovation_cov, observed))
+    S = as_matrix("innovation_cov", innovation_cov, innovation.shape[-1])
+    return nees(zero_missing(innovation, observed), masked_cov(S, observed))
 
 
 def nees(error: Tensor, cov: Tensor) -> Tensor:
