@@ -124,7 +124,8 @@ def main() -> None:
     args = start(__doc__ or "", env="walker2d", beliefs=known, peer_epochs=10)
     warnings.filterwarnings("ignore", category=FutureWarning)  # VecNorm
     small = ["collector.num_envs=2", "collector.steps_per_env=16", "optim.epochs=1"]
-    common = [f"env={args.env}", "env.version=v5", *((*small, "optim.minibatches=2") * args.quick)]
+    small += ["optim.minibatches=2", "optim.compile=false"]
+    common = [f"env={args.env}", "env.version=v5", *(small * args.quick)]
     cases = {DEFAULTS: [], "experiment=paper": ["experiment=paper"]}
     cases |= {f"belief={name}": [f"belief={name}"] for name in args.beliefs}
     ours = {name: recipe(*extra, *common) for name, extra in cases.items()}

@@ -8,8 +8,6 @@ same at each of them, with NaN in the place of what did not arrive and its own s
 import importlib
 import importlib.util
 import logging
-import os
-import shutil
 import statistics
 import timeit
 import warnings
@@ -27,7 +25,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from training.agent import add_primers
-from training.config import check_limits, command
+from training.config import check_limits, command, cpp_compiler
 from training.console import log_line
 from training.envs import make_env
 from training.errors import UserError
@@ -205,7 +203,7 @@ def _check(config: dict[str, Any]) -> tuple[str, Path]:
         raise UserError(
             f"`format=onnx` needs {' and '.join(missing)}: pip install {' '.join(missing)}"
         )
-    if kind == "aoti" and not any(map(shutil.which, (os.environ.get("CXX", "g++"), "clang++"))):
+    if kind == "aoti" and not cpp_compiler():
         raise UserError(
             "`format=aoti` needs a C++ compiler, g++ or clang++, and there is none: install one, "
             "or take format=export, which the robot's torch runs or compiles."

@@ -80,6 +80,27 @@ def test_traces_meet_an_operator():
 
 
 @built
+@pytest.mark.parametrize("propagated", [False, True])
+def test_a_compiled_graph_holds_it_and_serves_every_batch(propagated):
+    graphs = []
+
+    def backend(graph, inputs):
+        graphs.append(graph)
+        return graph
+
+    torch._dynamo.reset()  # it remembers which sizes have moved
+    compiled = torch.compile(filter_sequence, fullgraph=True, backend=backend)
+    for batch, time in ((3, 7), (4, 7), (9, 8), (2, 5), (8, 2), (5, 5)):
+        problem = Problem(3, 5, batch=batch, time=time, propagated=propagated)
+        given, start = (problem.model(), *problem.arguments()), {"cov": problem.start_cov}
+        found, expected = compiled(*given, **start), filter_sequence(*given, **start)
+        for name in ("mean", "log_likelihood"):
+            assert torch.equal(getattr(found, name), getattr(expected, name))
+    assert len(graphs) == 3  # one size, one time, any
+    assert all(operator in [node.target for node in graph.graph.nodes] for graph in graphs)
+
+
+@built
 def test_what_it_does_not_take_it_names():
     problem = Problem(2, 3)
     model, reason = problem.model(), native.unsupported_reason

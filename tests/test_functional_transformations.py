@@ -18,14 +18,15 @@ SIZES = pytest.mark.parametrize(
 )
 
 
-def total(problem):
+def total(problem, form="auto"):
     """A number of the start mean and of R, everything else fixed."""
     problem.leaves = {name: leaf.detach() for name, leaf in problem.leaves.items()}
     model, (_, *rest) = problem.model(), problem.arguments()
     stored = {**problem.stored(), "cov": problem.start_cov}
 
     def run(start, noise):
-        out = filter_sequence(replace(model, emission_cov=noise), start, *rest, **stored)
+        noisy = replace(model, emission_cov=noise)
+        out = filter_sequence(noisy, start, *rest, **stored, form=form)
         return out.mean.square().sum() + out.log_likelihood.sum()
 
     return run, (problem.leaves["start_mean"], problem.leaves["noise"])
@@ -56,8 +57,9 @@ def test_vmap_over_models_and_gradients_a_sample_equal_loops(obs, propagated):
 
 
 @SIZES
-def test_compiled_in_one_graph_it_is_the_same(obs, propagated):
-    run, given = total(Problem(3, obs, propagated=propagated, stored=True, time=3))
+@pytest.mark.parametrize("form", ["auto", "pytorch"])
+def test_compiled_in_one_graph_it_is_the_same(obs, propagated, form):
+    run, given = total(Problem(3, obs, propagated=propagated, stored=True, time=3), form)
     compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
     leaves = [[x.clone().requires_grad_() for x in given] for _ in range(2)]
     values = compiled(*leaves[0]), run(*leaves[1])
@@ -66,6 +68,20 @@ def test_compiled_in_one_graph_it_is_the_same(obs, propagated):
         value.backward()
     for a, b in zip(*leaves, strict=True):
         assert_equal(a.grad, b.grad)
+
+
+@SIZES
+def test_transformed_inside_a_compiled_function_it_is_the_same(obs, propagated):
+    run, (start, noise) = total(Problem(3, obs, propagated=propagated, time=2))
+
+    def change(start, noise):
+        slope = torch.func.jvp(run, (start, noise), (start, noise))[1]
+        return slope, torch.func.grad(run, (0, 1))(start, noise)
+
+    compiled = torch.compile(change, fullgraph=True, backend="aot_eager")
+    (slope, found), (wanted, grads) = compiled(start, noise), change(start, noise)
+    for a, b in zip((slope, *found), (wanted, *grads), strict=True):
+        assert_equal(a, b)
 
 
 @SIZES

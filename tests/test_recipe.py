@@ -114,6 +114,12 @@ def test_a_package_that_is_missing_is_one_line_and_leaves_nothing(
     assert not list(tmp_path.glob("run/*"))
 
 
+def test_a_missing_compiler_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with refused(r"`optim.compile=true` needs a C\+\+ compiler.*optim.compile=false"):
+        assembled(*SMOKE, "optim.compile=true")
+
+
 def test_one_seed_gives_one_result_and_another_seed_another(smoke, tmp_path):
     run(tmp_path / "again", *SMOKE)
     assert_same_run(smoke, tmp_path / "again")

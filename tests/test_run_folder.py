@@ -20,6 +20,8 @@ from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoin
 from training.errors import UserError
 from training.run_folder import Table, read_config
 
+compiles = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+
 
 def contents(folder):
     return {str(p): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
@@ -157,8 +159,9 @@ def test_a_checkpoint_of_another_shape_is_refused(smoke, overrides):
         ("belief=drbpn", "env=hopper", "missingness=mar"),
         ("missingness=outages", "missingness.group_by=joint", "noise=spikes"),
         ("belief=drbpn_propagated", "missingness=mcar"),
+        pytest.param(("optim.compile=true",), marks=[compiles, pytest.mark.slow]),
     ],
-    ids=["hopper", "outages-spikes", "propagated"],
+    ids=["hopper", "outages-spikes", "propagated", "compiled"],
 )
 def test_a_resumed_run_equals_one_that_never_stopped(overrides, tmp_path):
     straight = tmp_path / "straight"

@@ -4,6 +4,7 @@ import datetime
 import difflib
 import os
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import inf
@@ -48,6 +49,12 @@ def composed_config(overrides: Sequence[str] = ()) -> DictConfig:
             return checked(hydra.compose("config", list(overrides)), overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error)) from error
+
+
+def cpp_compiler() -> str | None:
+    """Return the C++ compiler that torch.compile and AOTInductor will call; None without one."""
+    names = (os.environ.get("CXX", "g++"), "clang++")
+    return next(filter(None, map(shutil.which, names)), None)
 
 
 def choice(group: str, name: str, **values: Any) -> DictConfig:

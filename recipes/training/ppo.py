@@ -10,7 +10,8 @@ from torchrl.objectives.value import GAE
 
 from torchrl_drbpn import BeliefModelLoss, DRBPNLoss
 from training.agent import Agent
-from training.errors import DivergedError
+from training.config import cpp_compiler
+from training.errors import DivergedError, UserError
 
 _ESTIMATES = ("advantage", "value_target", "state_value")
 _NAMES = {"kl_approx": "kl", "ESS": "ess"}
@@ -100,12 +101,18 @@ class GradientSteps:
         minibatches: int,
         sequence_length: int,
         recompute_advantages: bool,
+        compile: bool,
     ) -> None:
+        if compile and not cpp_compiler():
+            raise UserError(
+                "`optim.compile=true` needs a C++ compiler, g++ or clang++, and there is none: "
+                "install one, or take optim.compile=false, which is slower."
+            )
         self.parameters = list(parameters)
         self.optimizer = optimizer(self.parameters, lr=lr)
         self.lr, self.max_grad_norm = lr, max_grad_norm
         self.epochs, self.minibatches, self.sequence_length = epochs, minibatches, sequence_length
-        self.recompute_advantages = recompute_advantages
+        self.recompute_advantages, self.compile = recompute_advantages, compile
 
 
 class PPO:
@@ -115,6 +122,7 @@ class PPO:
         self, agent: Agent, *, loss: LossModule, steps: GradientSteps, gae: GAE, seed: int
     ) -> None:
         self.agent, self.loss, self.steps, self.gae = agent, loss, steps, gae
+        self.terms = torch.compile(loss) if steps.compile else loss
         # Without memory no gradient flows through time: steps drawn one by one depend less on each
         # other than sequences do, and train better for nothing (docs/reproduction.md).
         self.sequence_length = steps.sequence_length if agent.recurrent else 1
@@ -150,7 +158,7 @@ class PPO:
 
     def step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
         """Take one gradient step; return what the loss reports, and ``grad_norm``."""
-        terms = dict(self.loss(minibatch).items())
+        terms = dict(self.terms(minibatch).items())
         losses = {key: value for key, value in terms.items() if key.startswith("loss")}
         check_finite(losses, "loss")
         self.steps.optimizer.zero_grad()

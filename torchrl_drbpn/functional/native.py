@@ -53,6 +53,7 @@ def load(path: Path) -> ctypes.CDLL | str:
     return library
 
 
+@torch.compiler.assume_constant_result
 def native_status() -> str | None:
     """Say why the native form of the filter cannot run on this machine; None where it can.
 
@@ -78,17 +79,18 @@ def unsupported_reason(
         return "it propagates a covariance by one Jacobian, with a diagonal emission_cov"
     own = (Q, *list(vars(model).values())[2:], *f.weights, *f.biases)
     given = [x for x in (*own, *tensors) if x is not None]
-    if torch.compiler.is_compiling():
-        return "torch.compile and torch.export trace PyTorch's operations"
+    if torch.compiler.is_exporting():
+        return "an exported program runs where this package is not"
     # functorch has no public word for "a transformation is running", and a tensor under one looks
     # like any other; inside one an autograd.Function below the dispatcher has no kernel, wrapped
     # inputs (torch.func.debug_unwrap) or not.
     if torch._C._are_functorch_transforms_active():
         return "torch.func transforms PyTorch's operations"
     # A new object comes back inside a forward-mode level, where tensors may carry tangents.
-    dual = forward_ad.unpack_dual(given[0])  # type: ignore[no-untyped-call]
-    if dual.primal is not given[0]:
-        return "it has no forward-mode derivative"
+    if not torch.compiler.is_compiling():  # a traced tensor is another object every time
+        dual = forward_ad.unpack_dual(given[0])  # type: ignore[no-untyped-call]
+        if dual.primal is not given[0]:
+            return "it has no forward-mode derivative"
     for x in given:
         if type(x) is not Tensor and type(x) is not torch.nn.Parameter:
             return f"{type(x).__name__} is a class of its own"
@@ -163,8 +165,8 @@ class _Call:
         if self.propagated and not all(needed):
             raise ValueError("`F` must come with `cov`, `stored_cov` beside `stored`, R diagonal.")
         size = state if self.information else obs
-        smallest = min(batch, time, obs, state, actions, *widths)
-        if size > _MAX_SIZE or len(widths) > _MAX_LAYERS + 1 or smallest < 1:
+        empty = any(n < 1 for n in (batch, time, obs, state, actions, *widths))
+        if size > _MAX_SIZE or len(widths) > _MAX_LAYERS + 1 or empty:
             raise ValueError(f"no size may be 0, none factorised over {_MAX_SIZE}; got {shapes}.")
         library = _library()
         if isinstance(library, str):
@@ -175,6 +177,10 @@ class _Call:
         ]  # fmt: skip
         self.library, self.kind, self.mean_shape = library, _KINDS[own], (batch, time, state)
         self.cov_shape = (batch, time, state, state) if self.propagated else (0,)
+        self.tape: Any
+        if any(isinstance(n, torch.SymInt) for n in numbers):  # traced for every size at once
+            self.tape = torch.library.get_ctx().new_dynamic_size()
+            return
         self.sizes, counts = (ctypes.c_int64 * len(numbers))(*numbers), (ctypes.c_int64 * 3)()
         getattr(library, f"sizes_{self.kind}")(self.sizes, counts)
         self.tape, self.scratch, self.scratch_back = counts
