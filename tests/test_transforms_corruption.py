@@ -244,7 +244,7 @@ test_what_cannot_be_is_refused_in_one_line = refuses(
     *[(lambda s=s: MAR(always_observed=s),
        r"`always_observed` must be a share in \[0, 1\)") for s in (-0.1, 1.0, 2, math.nan)],
     (lambda: staircase(MAR(always_observed=0.95)).reset(),
-     r"`always_observed` must leave .* 0.95 of 5 entries"),
+     r"`always_observed` must be a share that leaves .* 0.95 of 5 entries"),
     (lambda: MAR()._step(TensorDict({}, [4]), data()), KeyError,
      "`ObservationMissingness` reads 'action', which is not"),
     (lambda: staircase(MAR(action_key="torque")).rollout(2), KeyError,

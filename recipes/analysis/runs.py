@@ -37,7 +37,7 @@ _EVALUATION = [
 _EPISODE = ["frames", "point", "mode", "return", "length", "missing_ratio"]
 # Settings that change no number that is reported, or are columns of their own.
 _NOT_COMPARED = (
-    *("threads", "resume", "logger.", "checkpoint.", "evaluation.", "method"),
+    *("threads", "optim.compile", "resume", "logger.", "checkpoint.", "evaluation.", "method"),
     *("transforms.noise.", "transforms.missingness."),  # again what noise and missingness say
 )
 _VERSIONS = ("torch", "torchrl", "gymnasium", "mujoco", "git_commit")

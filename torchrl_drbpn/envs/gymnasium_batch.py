@@ -74,8 +74,6 @@ class GymnasiumBatchEnv(SimulatorBatch):
         True
     """
 
-    # Stepping -------------------------------------------------------------------------------
-
     def _build(self) -> tuple[Any, Any, int | None, int | None]:
         """Make the environments, without the outermost time limit, which the batch keeps."""
         try:
@@ -166,8 +164,6 @@ class GymnasiumBatchEnv(SimulatorBatch):
         for env in self.envs:
             env.close()
         self._pool.shutdown()
-
-    # Saving ---------------------------------------------------------------------------------
 
     @property
     def supports_state(self) -> bool:

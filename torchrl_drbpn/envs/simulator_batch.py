@@ -259,9 +259,7 @@ class SimulatorBatch(EnvBase):
 
     def extra_repr(self) -> str:
         """Name task, number of environments, device and dtype."""
-        return (
-            f"{self.env_id!r}, num_envs={self.num_envs}, device={self.device}, dtype={self.dtype}"
-        )
+        return f"{self.env_id!r}, num_envs={self.num_envs}, {self.device}, {self.dtype}"
 
 
 def one_line(thing: object) -> str:

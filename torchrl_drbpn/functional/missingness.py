@@ -55,14 +55,11 @@ def draw_mechanism(
     """
     if kind not in ("mar", "nmar"):
         raise ValueError(f'`kind` must be "mar" or "nmar", got {kind!r}; "mcar" has no parameters.')
-    if not 0.0 <= always_observed <= 1.0:
-        raise ValueError(f"`always_observed` must be a share in [0, 1], got {always_observed}.")
-    count = max(1, round(always_observed * obs_dim))
-    if count >= obs_dim:
+    share = always_observed
+    if not 0.0 <= share <= 1.0 or (count := max(1, round(share * obs_dim))) >= obs_dim:
         raise ValueError(
-            f"`always_observed` must leave an entry that can go missing, got {always_observed} of "
-            f"{obs_dim} entries, which is all of them. Pass a smaller share, or another mechanism "
-            "where there is one entry."
+            "`always_observed` must be a share that leaves an entry that can go missing, got "
+            f"{share} of {obs_dim} entries: of a single entry MCAR alone can be asked."
         )
     always = torch.zeros(obs_dim, dtype=torch.bool)
     always[torch.randperm(obs_dim, generator=generator)[:count]] = True

@@ -19,7 +19,6 @@ from torchrl_drbpn.functional.gaussian import zero_missing
 Keys: TypeAlias = NestedKey | Sequence[NestedKey]
 
 
-# ------------------------------------------------------------------------------------------- keys
 def as_key_list(keys: Keys) -> list[NestedKey]:
     """Return one key, or a list of keys, as a list; a tuple of strings is one nested key."""
     items: list[Any] = [keys] if isinstance(keys, str | tuple) else list(keys)
@@ -54,7 +53,6 @@ def pair_keys(
     return pairs
 
 
-# ---------------------------------------------------------------------------------------- numbers
 def read_numbers(
     value: object,
     name: str,
@@ -85,7 +83,6 @@ def check_count(numbers: Tensor | None, name: str, count: int, per: str) -> None
         )
 
 
-# --------------------------------------------------------------- checks, of specs and of data alike
 def read_leaf(source: Any, key: NestedKey, owner: Transform) -> Any:
     """Return the tensor or spec under `key`, or raise a KeyError that names the transform."""
     leaf = source.get(key, None)
@@ -120,7 +117,6 @@ def check_mask(mask: Tensor | TensorSpec, observation: Tensor | TensorSpec, key:
         )
 
 
-# ------------------------------------------------------------------------------------------ specs
 def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transform) -> None:
     """Enter a key into `spec` that nothing else may write."""
     if key in spec.keys(True, True):
@@ -132,7 +128,6 @@ def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transfor
     spec[key] = leaf
 
 
-# ------------------------------------------------------------------------------------- environment
 def environment_of(transform: Transform) -> EnvBase | None:
     """Return the environment that holds the transform, if any does."""
     try:
@@ -185,7 +180,6 @@ class EnvironmentTransform(Transform):
         raise self._refuse()
 
 
-# -------------------------------------------------------------------------------------- corruption
 class Step(NamedTuple):
     """What a corrupting transform works on.
 
