@@ -1,5 +1,6 @@
 """Clipped PPO and the likelihood of the belief's model: loss, advantages, minibatches, steps."""
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
@@ -123,6 +124,8 @@ class PPO:
     ) -> None:
         self.agent, self.loss, self.steps, self.gae = agent, loss, steps, gae
         self.terms = torch.compile(loss) if steps.compile else loss
+        # Of the compiler about itself, into the progress bar.
+        warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\._inductor")
         # Without memory no gradient flows through time: steps drawn one by one depend less on each
         # other than sequences do, and train better for nothing (docs/reproduction.md).
         self.sequence_length = steps.sequence_length if agent.recurrent else 1
