@@ -275,7 +275,7 @@ def _forward_fake(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _backward_fake(*arguments: Any) -> list[Tensor]:
     x, _, action, _, _, stored, start, _, _, *model, _ = arguments[3 : 3 + _TENSORS]
     wanted = (x, action, stored, start, *model, *arguments[3 + _TENSORS])
-    return [torch.empty_like(v) for v in wanted if v is not None]
+    return [v.new_empty(v.shape) for v in wanted if v is not None]  # dense, whatever v is
 
 
 class _Filter(torch.autograd.Function):
