@@ -50,6 +50,21 @@ def test_it_passes_the_checks_of_torch_library(obs, dtype, propagated):
 
 
 @built
+def test_a_trace_knows_that_gradients_are_dense_whatever_the_input_was():
+    problem = Problem(3, 5)
+    arguments = [
+        x.detach() if isinstance(x, torch.Tensor) else x for x in problem.operator_arguments()
+    ]
+    arguments[17] = [x.detach() for x in arguments[17]]
+    arguments[0] = arguments[0].mT.contiguous().mT
+    mean, ll, tape, _ = operator(*arguments)
+    given = (torch.ones_like(mean), torch.ones_like(ll), tape, *arguments)
+    backward = torch.ops.torchrl_drbpn.filter_rows_backward
+    found = torch.library.opcheck(backward, given, test_utils="test_faketensor")
+    assert set(found.values()) == {"SUCCESS"}
+
+
+@built
 @pytest.mark.parametrize("propagated", [False, True])
 def test_vmap_over_it_equals_a_loop(propagated):
     arguments = Problem(3, 5, propagated=propagated).operator_arguments()
