@@ -171,8 +171,9 @@ def test_resume_takes_the_settings_of_its_folder_and_only_the_allowed_overrides(
 @pytest.mark.parametrize(
     ("word", "line"),
     [
-        ("seed=1", "only total_frames, device, logger, evaluation .*seed=1"),
-        ("env=hopper", "only total_frames, device, logger, evaluation .*env=hopper"),
+        ("seed=1", "only total_frames, device, optim.compile, logger, evaluation .*seed=1"),
+        ("env=hopper", "only total_frames, device, optim.compile, logger, .*env=hopper"),
+        ("optim.lr=1", "only total_frames, device, optim.compile, logger, .*optim.lr=1"),
         ("hydra.run.dir=there", "`resume` names the run folder already; .*hydra.run.dir=there"),
     ],
 )

@@ -5,6 +5,7 @@ import functools
 import pytest
 import references
 import torch
+from filter_problems import built
 from refusals import refuses
 from small_agents import ACTION, OBS, TIME, add_advantages, collect, make_agent, make_filter
 from suites import LossSuite
@@ -117,6 +118,23 @@ def test_compiled_ahead_of_time_the_gradients_are_the_same():
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     grads = [gradients(agent, summed(out)) for out in (loss(data), compiled(data))]
     torch.testing.assert_close(*grads, rtol=1e-9, atol=1e-12)
+
+
+@built
+@filters
+@pytest.mark.parametrize("functional", [True, False])
+def test_compiled_it_holds_both_passes_of_the_native_filter(functional, covariance):
+    data, graphs = make_data(torch.float64, covariance), []
+
+    def backend(graph, _):
+        graphs.append(graph)
+        return graph
+
+    torch._dynamo.reset()
+    agent = make_belief_agent(torch.float64, covariance)
+    torch.compile(make_loss(agent, ppo={"functional": functional}), backend=backend)(data)
+    operator = torch.ops.torchrl_drbpn.filter_rows
+    assert [n.target for graph in graphs for n in graph.graph.nodes].count(operator) == 2
 
 
 def reference(agent, data):

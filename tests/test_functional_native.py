@@ -95,8 +95,9 @@ def test_traces_meet_an_operator():
 
 
 @built
+@pytest.mark.parametrize("fullgraph", [False, True])
 @pytest.mark.parametrize("propagated", [False, True])
-def test_a_compiled_graph_holds_it_and_serves_every_batch(propagated):
+def test_a_compiled_graph_holds_it_and_serves_every_batch(propagated, fullgraph):
     graphs = []
 
     def backend(graph, inputs):
@@ -104,7 +105,7 @@ def test_a_compiled_graph_holds_it_and_serves_every_batch(propagated):
         return graph
 
     torch._dynamo.reset()  # it remembers which sizes have moved
-    compiled = torch.compile(filter_sequence, fullgraph=True, backend=backend)
+    compiled = torch.compile(filter_sequence, fullgraph=fullgraph, backend=backend)
     for batch, time in ((3, 7), (4, 7), (9, 8), (2, 5), (8, 2), (5, 5)):
         problem = Problem(3, 5, batch=batch, time=time, propagated=propagated)
         given, start = (problem.model(), *problem.arguments()), {"cov": problem.start_cov}

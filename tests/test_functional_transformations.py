@@ -78,6 +78,10 @@ def test_transformed_inside_a_compiled_function_it_is_the_same(obs, propagated):
         slope = torch.func.jvp(run, (start, noise), (start, noise))[1]
         return slope, torch.func.grad(run, (0, 1))(start, noise)
 
+    with forward_ad.dual_level():
+        dual = torch.compile(run, backend="eager")(forward_ad.make_dual(start, start), noise)
+        tangent = forward_ad.unpack_dual(dual).tangent
+    assert_equal(tangent, torch.func.jvp(lambda x: run(x, noise), (start,), (start,))[1])
     compiled = torch.compile(change, fullgraph=True, backend="aot_eager")
     (slope, found), (wanted, grads) = compiled(start, noise), change(start, noise)
     for a, b in zip((slope, *found), (wanted, *grads), strict=True):

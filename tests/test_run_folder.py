@@ -226,6 +226,15 @@ def test_a_run_that_lacks_its_final_evaluation_gets_it(folder, smoke):
     assert_same_run(smoke, folder)
 
 
+def test_a_compiled_run_goes_on_where_there_is_no_compiler(folder, monkeypatch):
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(text.replace("compile: false", "compile: true"))
+    monkeypatch.setenv("PATH", str(folder))
+    with refused("optim.compile=false"):
+        resume(folder, "total_frames=768")
+    assert resume(folder, "total_frames=768", "optim.compile=false") == 0
+
+
 def test_more_frames_can_be_added_to_a_finished_run_and_none_taken_away(folder):
     assert resume(folder, "total_frames=768") == 0
     rows = read_table(folder / "metrics.csv")

@@ -26,7 +26,7 @@ _PACKAGES = (
     *("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "envpool", "numpy", "hydra-core"),
     "torchrl_drbpn",
 )
-MAY_CHANGE = ("total_frames", "device", "logger", "evaluation")  # with resume=
+MAY_CHANGE = ("total_frames", "device", "optim.compile", "logger", "evaluation")  # with resume=
 # Of evaluation.csv: one row an evaluation and kind of action.
 EVALUATION_COLUMNS = (
     *("frames", "kind", "mode", "episodes", "return_mean", "return_std", "length_mean"),
@@ -144,7 +144,7 @@ def resumed_config(composed: DictConfig, overrides: Sequence[str], folder: Path)
             raise UserError(f"`resume` names the run folder already; leave out {word!r}.")
         if group in ("resume", "hydra"):
             continue
-        if group not in MAY_CHANGE:
+        if group not in MAY_CHANGE and name not in MAY_CHANGE:
             raise UserError(
                 f"`resume` continues a run with its own settings; only {', '.join(MAY_CHANGE)} "
                 f"may be given with it, got {word!r}."

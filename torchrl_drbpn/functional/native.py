@@ -11,11 +11,12 @@ import itertools
 from collections.abc import Sequence
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.fx.experimental.symbolic_shapes import guard_or_true
 
 from torchrl_drbpn.functional.pytorch_form import Filtered, run_in_pytorch
 from torchrl_drbpn.functional.state_space import FilterInputs, StateSpace, TransitionMLP
@@ -25,6 +26,7 @@ _KINDS = {torch.float32: "float", torch.float64: "double"}
 _WIDTHS = {"AVX512": "avx512", "AVX2": "avx2"}
 _MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
 _MAX_LAYERS = 15
+_GROUP = 8  # rows that C factorises side by side
 _TENSORS = 17  # arguments of the operator before the network's layers
 
 
@@ -86,13 +88,12 @@ def unsupported_reason(
     # inputs (torch.func.debug_unwrap) or not.
     if torch._C._are_functorch_transforms_active():
         return "torch.func transforms PyTorch's operations"
-    # A new object comes back inside a forward-mode level, where tensors may carry tangents.
-    if not torch.compiler.is_compiling():  # a traced tensor is another object every time
-        dual = forward_ad.unpack_dual(given[0])  # type: ignore[no-untyped-call]
-        if dual.primal is not given[0]:
-            return "it has no forward-mode derivative"
+    # Nor is there one for an open level of forward mode, in which tensors may carry tangents; in a
+    # traced function no tensor tells.
+    if forward_ad._current_level >= 0:
+        return "it has no forward-mode derivative"
     for x in given:
-        if type(x) is not Tensor and type(x) is not torch.nn.Parameter:
+        if type(x) not in (Tensor, torch.nn.Parameter, torch.nn.Buffer):
             return f"{type(x).__name__} is a class of its own"
         if not x.is_cpu:
             return "it runs on the CPU"
@@ -106,7 +107,7 @@ def unsupported_reason(
         return f"{name} is {size}, more than {_MAX_SIZE}"
     if len(f.weights) > _MAX_LAYERS:
         return f"the transition has more than {_MAX_LAYERS} layers"
-    if any(x.numel() == 0 for x in given):
+    if any(guard_or_true(x.numel() == 0) for x in given):  # or a number that only the data know
         return "there is nothing to filter"
     return native_status() if weight is None else "it takes no weights"
 
@@ -126,6 +127,20 @@ def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
         model.action_matrix, model.emission_offset, model.initial_mean, model.transition_jacobian,
         list(layers), f.residual, f.activation == "tanh",
     )  # fmt: skip
+
+
+def _count(kind: str, numbers: Sequence[int]) -> tuple[Any, list[int]]:
+    """Return sizes as C takes them, and its count of tape, scratch and scratch of backward."""
+    sizes, counts = (ctypes.c_int64 * len(numbers))(*numbers), (ctypes.c_int64 * 3)()
+    getattr(_library(), f"sizes_{kind}")(sizes, counts)
+    return sizes, list(counts)
+
+
+@functools.cache
+def _tape_of_a_group(kind: str, *rest: int) -> tuple[int, int]:
+    """Return the length of the tape of one group of rows, and what each further one adds."""
+    one, two = (_count(kind, (groups * _GROUP, 1, *rest))[1][0] for groups in (1, 2))
+    return one, two - one
 
 
 class _Call:
@@ -175,22 +190,25 @@ class _Call:
             batch, time, obs, state, actions, len(widths) - 1, residual, not tanh, R.ndim == 2,
             state, self.information, self.propagated, *widths[1:],
         ]  # fmt: skip
-        self.library, self.kind, self.mean_shape = library, _KINDS[own], (batch, time, state)
+        self.kind, self.mean_shape = _KINDS[own], (batch, time, state)
         self.cov_shape = (batch, time, state, state) if self.propagated else (0,)
-        self.tape: Any
-        if any(isinstance(n, torch.SymInt) for n in numbers):  # traced for every size at once
-            self.tape = torch.library.get_ctx().new_dynamic_size()
-            return
-        self.sizes, counts = (ctypes.c_int64 * len(numbers))(*numbers), (ctypes.c_int64 * 3)()
-        getattr(library, f"sizes_{self.kind}")(self.sizes, counts)
-        self.tape, self.scratch, self.scratch_back = counts
+        # By a formula: a trace serves every number of rows, batch and time being symbols there.
+        one, more = _tape_of_a_group(self.kind, *map(int, numbers[2:]))
+        self.numbers, self.tape = numbers, one + more * ((batch * time - 1) // _GROUP)
+
+    def measure(self) -> Self:
+        """Have C count its memory, where the sizes are numbers."""
+        self.sizes, (least, self.scratch, self.scratch_back) = _count(self.kind, self.numbers)
+        if least > self.tape:
+            raise RuntimeError(f"the tape must hold {least} numbers, got {self.tape}.")
+        return self
 
     def run(self, name: str, *pointers: Tensor | None) -> None:
         """Call a function of the library."""
         found = (ctypes.c_void_p * len(pointers))(
             *[None if x is None else x.data_ptr() for x in pointers]
         )
-        getattr(self.library, f"{name}_{self.kind}")(self.sizes, found)
+        getattr(_library(), f"{name}_{self.kind}")(self.sizes, found)
 
 
 def _doubles(count: int) -> Tensor:
@@ -215,7 +233,7 @@ def _inverses(call: _Call, covs: Sequence[Tensor]) -> tuple[list[Tensor], Tensor
 
 
 def _forward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    call, dense = _Call(arguments), _dense(arguments)
+    call, dense = _Call(arguments).measure(), _dense(arguments)
     x, observed, reset, F = dense[0], dense[1], dense[3], dense[16]
     mean, ll = x.new_empty(call.mean_shape), x.new_empty(reset.shape, dtype=torch.float64)
     cov = x.new_empty(call.cov_shape)
@@ -236,7 +254,7 @@ def _backward(
     by_mean: Tensor | None, by_ll: Tensor | None, tape: Tensor, *arguments: Any
 ) -> list[Tensor]:
     """Return the gradients by observation, action, stored mean, start and the model's tensors."""
-    call, dense = _Call(arguments), _dense(arguments)
+    call, dense = _Call(arguments).measure(), _dense(arguments)
     x, observed, action, reset, use_stored, stored, start, _, _, *model = dense
     R, H, B, layers = *model[2:5], model[8:]
     if tape.shape != (call.tape,) or tape.dtype != torch.float64 or not tape.is_contiguous():
