@@ -8,7 +8,8 @@ import torch
 from filter_problems import Problem, assert_equal, sequences, space
 
 from torchrl_drbpn import BeliefFilter
-from torchrl_drbpn.functional import Belief, forecast, row_jacobian, smooth_sequence
+from torchrl_drbpn.functional import Belief, forecast, smooth_sequence
+from torchrl_drbpn.functional.smoothing import row_jacobian
 
 
 def linear(time=7, *, batch=3, reset_rate=0.3, seed=0):

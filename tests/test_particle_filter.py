@@ -10,6 +10,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torchrl_drbpn import ParticleFilterModule
 from torchrl_drbpn import functional as F
+from torchrl_drbpn.functional.particles import systematic_ancestors
 from torchrl_drbpn.modules import particle_model
 
 
@@ -80,7 +81,7 @@ def test_many_particles_are_each_by_hand_over_a_resampled_memory():
     died = 0
     for t in range(4):
         frame = data[:, t].unsqueeze(-1).expand(2, K)
-        ancestors = F.systematic_ancestors(log_weight, noise.resampling[:, t])
+        ancestors = systematic_ancestors(log_weight, noise.resampling[:, t])
         died += (ancestors != torch.arange(K)).sum().item()
         hidden = torch.stack([hidden[b, ancestors[b]] for b in range(2)])
         log_q, log_p, seen, hidden, phi = by_hand(filter, hidden, frame, noise.proposal[:, t])
@@ -222,7 +223,7 @@ def test_systematic_resampling_gives_each_particle_its_share_rounded_and_on_aver
     g = torch.Generator().manual_seed(0)
     log_weight = torch.randn(7, generator=g, dtype=torch.float64)
     uniform = (torch.arange(2000, dtype=torch.float64) + 0.5).unsqueeze(-1) / 2000
-    ancestors = F.systematic_ancestors(log_weight.expand(2000, 7), uniform)
+    ancestors = systematic_ancestors(log_weight.expand(2000, 7), uniform)
     share = 7 * log_weight.softmax(-1)
     offspring = torch.nn.functional.one_hot(ancestors, 7).sum(-2).double()
     assert (offspring >= share.floor()).all()
@@ -232,10 +233,10 @@ def test_systematic_resampling_gives_each_particle_its_share_rounded_and_on_aver
 
 def test_equal_weights_keep_every_particle_and_a_zero_weight_none():
     uniform = torch.tensor([[0.01], [0.5], [0.99]])
-    assert F.systematic_ancestors(torch.zeros(3, 8), uniform).eq(torch.arange(8)).all()
+    assert systematic_ancestors(torch.zeros(3, 8), uniform).eq(torch.arange(8)).all()
     log_weight = torch.zeros(3, 4)
     log_weight[:, [0, 3]] = -torch.inf
-    assert F.systematic_ancestors(log_weight, uniform).tolist() == [[1, 1, 2, 2]] * 3
+    assert systematic_ancestors(log_weight, uniform).tolist() == [[1, 1, 2, 2]] * 3
 
 
 class LinearGaussian:

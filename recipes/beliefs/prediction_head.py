@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from beliefs import FORECAST, FORECAST_COV, OBSERVATION
-from torchrl_drbpn.functional import inverse_softplus, positive_std, zero_missing
+from torchrl_drbpn.functional.gaussian import inverse_softplus, positive_std, zero_missing
 
 
 class PredictionHead(nn.Module):

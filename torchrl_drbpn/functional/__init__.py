@@ -16,11 +16,8 @@ from torchrl_drbpn.functional.filtering import (
 from torchrl_drbpn.functional.gaussian import (
     Belief,
     full_cov,
-    inverse_softplus,
     masked_cov,
     masked_log_density,
-    positive_std,
-    tril_to_vector,
     zero_missing,
 )
 from torchrl_drbpn.functional.kalman import (
@@ -34,7 +31,6 @@ from torchrl_drbpn.functional.kalman import (
 )
 from torchrl_drbpn.functional.missingness import (
     MissingnessMechanism,
-    OutageRates,
     draw_mechanism,
     missing_probability,
     outage_rates,
@@ -54,16 +50,10 @@ from torchrl_drbpn.functional.particles import (
     ProposalOutput,
     particle_sequence,
     particle_step,
-    systematic_ancestors,
 )
 from torchrl_drbpn.functional.robust import innovation_weights, robust_sequence_weights
 from torchrl_drbpn.functional.sensor_selection import SensorSelection, select_sensors
-from torchrl_drbpn.functional.smoothing import (
-    Forecast,
-    forecast,
-    row_jacobian,
-    smooth_sequence,
-)
+from torchrl_drbpn.functional.smoothing import Forecast, forecast, smooth_sequence
 from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP, predict_step, propagate
 
 __all__ = [
@@ -74,7 +64,6 @@ __all__ = [
     "Forecast",
     "MaskModel",
     "MissingnessMechanism",
-    "OutageRates",
     "ParticleModel",
     "ParticleNoise",
     "ParticleOutput",
@@ -93,7 +82,6 @@ __all__ = [
     "full_cov",
     "innovation",
     "innovation_weights",
-    "inverse_softplus",
     "log_likelihood",
     "masked_cov",
     "masked_log_density",
@@ -104,12 +92,10 @@ __all__ = [
     "outage_rates",
     "particle_sequence",
     "particle_step",
-    "positive_std",
     "predict",
     "predict_step",
     "propagate",
     "robust_sequence_weights",
-    "row_jacobian",
     "sample_delay",
     "sample_mask",
     "sample_noise",
@@ -118,8 +104,6 @@ __all__ = [
     "select_sensors",
     "sequential_update",
     "smooth_sequence",
-    "systematic_ancestors",
-    "tril_to_vector",
     "update",
     "update_by_mask",
     "zero_missing",

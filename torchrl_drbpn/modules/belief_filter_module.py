@@ -8,8 +8,8 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_drbpn.functional import innovation, tril_to_vector
-from torchrl_drbpn.functional.gaussian import without_autocast
+from torchrl_drbpn.functional import innovation
+from torchrl_drbpn.functional.gaussian import tril_to_vector, without_autocast
 from torchrl_drbpn.modules.belief_filter import BeliefFilter
 from torchrl_drbpn.modules.recurrent_belief import Keys, RecurrentBeliefModule
 

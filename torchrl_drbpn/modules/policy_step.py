@@ -10,10 +10,9 @@ from torchrl_drbpn.functional import (
     innovation_weights,
     propagate,
     sequential_update,
-    tril_to_vector,
     zero_missing,
 )
-from torchrl_drbpn.functional.gaussian import masked_cov, rounded_cov
+from torchrl_drbpn.functional.gaussian import masked_cov, rounded_cov, tril_to_vector
 from torchrl_drbpn.modules.belief_filter_module import BeliefFilterModule
 from torchrl_drbpn.modules.normalization import MaskedObservationNorm
 from torchrl_drbpn.modules.state_space import GaussianTransition, jacobian_of

@@ -8,14 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from torchrl_drbpn.functional import (
-    Belief,
-    TransitionMLP,
-    full_cov,
-    inverse_softplus,
-    positive_std,
-    row_jacobian,
-)
+from torchrl_drbpn.functional import Belief, TransitionMLP
+from torchrl_drbpn.functional.gaussian import full_cov, inverse_softplus, positive_std
+from torchrl_drbpn.functional.smoothing import row_jacobian
 
 CovKind = Literal["diag", "full"]
 Function = Callable[[Tensor, Tensor], Tensor]
