@@ -12,7 +12,6 @@ on plain tensors (PolicyStep), exported by torch.export, and compiled ahead of t
 from __future__ import annotations
 
 import logging
-import shutil
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -95,14 +94,12 @@ def main() -> None:
     common = [f"env={args.env}", "env.version=v5"]
     if args.quick:
         common += ["collector.num_envs=2", "collector.steps_per_env=16", "optim.minibatches=2"]
+        common += ["optim.compile=false"]
     for name in ("defaults", "experiment=paper", "belief=none"):
         training, _ = recipe(*([name] * (name != "defaults")), *common)
         calls, batch = update_parts(training)
         title = f"update, {name}, minibatch of {batch.shape[0]} x {batch.shape[1]} frames"
         show(title, measure(calls, args, calls=5), WHOLE, args)
-    compiler = shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        print("AOTInductor left out: no C++ compiler (g++ or clang++) in PATH.")
     training, _ = recipe(*common)
     with (
         torch.no_grad(),
@@ -110,8 +107,7 @@ def main() -> None:
         tempfile.TemporaryDirectory() as folder,
     ):
         for rows in (1, 64):
-            ahead = Path(folder) if compiler is not None and not args.quick else None
-            calls = decisions(training, rows, ahead)
+            calls = decisions(training, rows, None if args.quick else Path(folder))
             show(f"a decision, {rows} robots", measure(calls, args, calls=200), POLICY, args)
 
 

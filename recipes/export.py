@@ -25,7 +25,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from training.agent import add_primers
-from training.config import check_limits, command, cpp_compiler
+from training.config import check_limits, command, require_cpp_compiler
 from training.console import log_line
 from training.envs import make_env
 from training.errors import UserError
@@ -203,11 +203,9 @@ def _check(config: dict[str, Any]) -> tuple[str, Path]:
         raise UserError(
             f"`format=onnx` needs {' and '.join(missing)}: pip install {' '.join(missing)}"
         )
-    if kind == "aoti" and not cpp_compiler():
-        raise UserError(
-            "`format=aoti` needs a C++ compiler, g++ or clang++, and there is none: install one, "
-            "or take format=export, which the robot's torch runs or compiles."
-        )
+    if kind == "aoti":
+        instead = "format=export, which the robot's torch runs or compiles"
+        require_cpp_compiler("format=aoti", instead)
     return kind, out
 
 

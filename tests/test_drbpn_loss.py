@@ -5,7 +5,7 @@ import functools
 import pytest
 import references
 import torch
-from filter_problems import built
+from filter_problems import built, recording
 from refusals import refuses
 from small_agents import ACTION, OBS, TIME, add_advantages, collect, make_agent, make_filter
 from suites import LossSuite
@@ -126,13 +126,9 @@ def test_compiled_ahead_of_time_the_gradients_are_the_same():
 def test_compiled_it_holds_both_passes_of_the_native_filter(functional, covariance):
     data, graphs = make_data(torch.float64, covariance), []
 
-    def backend(graph, _):
-        graphs.append(graph)
-        return graph
-
     torch._dynamo.reset()
     agent = make_belief_agent(torch.float64, covariance)
-    torch.compile(make_loss(agent, ppo={"functional": functional}), backend=backend)(data)
+    torch.compile(make_loss(agent, ppo={"functional": functional}), backend=recording(graphs))(data)
     operator = torch.ops.torchrl_drbpn.filter_rows
     assert [n.target for graph in graphs for n in graph.graph.nodes].count(operator) == 2
 

@@ -2,7 +2,6 @@
 
 import ast
 import re
-import shutil
 import subprocess
 import sys
 
@@ -14,15 +13,14 @@ import save_agent
 import torch
 from evaluation.trained import WEIGHTS, load_trained_agent
 from evaluation_tools import ROOT, configured, evaluate
-from recipe_tools import printed, refused
+from recipe_tools import compiles, printed, refused
 
 DEPLOY = ROOT / "docs" / "deploy"
 WALKER = ROOT / "agents" / "walker2d"
-compiled = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 KINDS = [
     pytest.param("export", "p.pt2", id="export"),
     pytest.param("onnx", "p.onnx", id="onnx"),
-    pytest.param("aoti", "p.pt2", id="aoti", marks=[compiled, pytest.mark.slow]),
+    pytest.param("aoti", "p.pt2", id="aoti", marks=[compiles, pytest.mark.slow]),
 ]
 
 
@@ -109,7 +107,7 @@ def test_the_program_without_torch_walks(tmp_path):
 
 
 @pytest.mark.slow
-@compiled
+@compiles
 def test_the_programs_in_python_and_in_c_walk_and_decide(tmp_path):
     policy = exported(WALKER, tmp_path / "policy.pt2")
     assert walked("control_loop.py", policy) > 3000

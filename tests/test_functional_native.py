@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from filter_problems import Problem, assert_equal, assert_same, built
+from filter_problems import Problem, assert_equal, assert_same, built, recording
 from torch.autograd import forward_ad
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -100,12 +100,8 @@ def test_traces_meet_an_operator():
 def test_a_compiled_graph_holds_it_and_serves_every_batch(propagated, fullgraph):
     graphs = []
 
-    def backend(graph, inputs):
-        graphs.append(graph)
-        return graph
-
     torch._dynamo.reset()  # it remembers which sizes have moved
-    compiled = torch.compile(filter_sequence, fullgraph=fullgraph, backend=backend)
+    compiled = torch.compile(filter_sequence, fullgraph=fullgraph, backend=recording(graphs))
     for batch, time in ((3, 7), (4, 7), (9, 8), (2, 5), (8, 2), (5, 5)):
         problem = Problem(3, 5, batch=batch, time=time, propagated=propagated)
         given, start = (problem.model(), *problem.arguments()), {"cov": problem.start_cov}

@@ -114,10 +114,20 @@ def test_a_package_that_is_missing_is_one_line_and_leaves_nothing(
     assert not list(tmp_path.glob("run/*"))
 
 
-def test_a_missing_compiler_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with refused(r"`optim.compile=true` needs a C\+\+ compiler.*optim.compile=false"):
+def test_a_missing_compiler_is_one_line(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with refused(r"`optim.compile=true` needs .* `no-such-compiler` .* optim.compile=false"):
         assembled(*SMOKE, "optim.compile=true")
+
+
+@recipe_tools.compiles
+def test_a_loss_that_cannot_be_compiled_is_one_line():
+    line = "`optim.compile=true`: the compiled loss failed: .*optim.compile=false"
+    with torch.compiler.set_stance("fail_on_recompile"):
+        training, config = assembled(*SMOKE, "optim.compile=true")
+        with refused(line):
+            train_rollout(training, config)
+        train_rollout(*assembled(*SMOKE))  # nothing is compiled that was not asked for
 
 
 def test_one_seed_gives_one_result_and_another_seed_another(smoke, tmp_path):

@@ -15,12 +15,10 @@ import ppo_drbpn
 import pytest
 import recipe_tools
 import torch
-from recipe_tools import SMOKE, assert_same_run, read_table, refused, resume, run
+from recipe_tools import SMOKE, assert_same_run, compiles, read_table, refused, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.errors import UserError
 from training.run_folder import Table, read_config
-
-compiles = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 
 
 def contents(folder):

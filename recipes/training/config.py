@@ -51,10 +51,14 @@ def composed_config(overrides: Sequence[str] = ()) -> DictConfig:
         raise UserError(explain(error)) from error
 
 
-def cpp_compiler() -> str | None:
-    """Return the C++ compiler that torch.compile and AOTInductor will call; None without one."""
-    names = (os.environ.get("CXX", "g++"), "clang++")
-    return next(filter(None, map(shutil.which, names)), None)
+def require_cpp_compiler(setting: str, instead: str) -> None:
+    """Refuse a setting for which torch would call a C++ compiler that is not there."""
+    name = os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")
+    if shutil.which(name) is None:
+        raise UserError(
+            f"`{setting}` needs a C++ compiler, `{name}` is not there: install it, name another by "
+            f"the environment variable CXX, or take {instead}."
+        )
 
 
 def choice(group: str, name: str, **values: Any) -> DictConfig:

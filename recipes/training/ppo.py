@@ -6,12 +6,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
+from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
 from torchrl_drbpn import BeliefModelLoss, DRBPNLoss
 from training.agent import Agent
-from training.config import cpp_compiler
+from training.config import require_cpp_compiler
 from training.errors import DivergedError, UserError
 
 _ESTIMATES = ("advantage", "value_target", "state_value")
@@ -104,11 +105,8 @@ class GradientSteps:
         recompute_advantages: bool,
         compile: bool,
     ) -> None:
-        if compile and not cpp_compiler():
-            raise UserError(
-                "`optim.compile=true` needs a C++ compiler, g++ or clang++, and there is none: "
-                "install one, or take optim.compile=false, which is slower."
-            )
+        if compile:
+            require_cpp_compiler("optim.compile=true", "optim.compile=false, which is slower")
         self.parameters = list(parameters)
         self.optimizer = optimizer(self.parameters, lr=lr)
         self.lr, self.max_grad_norm = lr, max_grad_norm
@@ -123,9 +121,11 @@ class PPO:
         self, agent: Agent, *, loss: LossModule, steps: GradientSteps, gae: GAE, seed: int
     ) -> None:
         self.agent, self.loss, self.steps, self.gae = agent, loss, steps, gae
-        self.terms = torch.compile(loss) if steps.compile else loss
-        # Of the compiler about itself, into the progress bar.
-        warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\._inductor")
+        self.terms: Callable[[TensorDictBase], TensorDictBase] = loss
+        if steps.compile:
+            self.terms = torch.compile(loss)
+            # Of the compiler about itself, into the progress bar.
+            warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\._inductor")
         # Without memory no gradient flows through time: steps drawn one by one depend less on each
         # other than sequences do, and train better for nothing (docs/reproduction.md).
         self.sequence_length = steps.sequence_length if agent.recurrent else 1
@@ -161,7 +161,16 @@ class PPO:
 
     def step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
         """Take one gradient step; return what the loss reports, and ``grad_norm``."""
-        terms = dict(self.terms(minibatch).items())
+        try:
+            terms = dict(self.terms(minibatch).items())
+        except RuntimeError as error:  # torch has no public name for what a compiler raises
+            if not self.steps.compile or isinstance(error, LinAlgError):
+                raise
+            reason = str(error).partition("\n")[0]
+            raise UserError(
+                f"`optim.compile=true`: the compiled loss failed: {reason}. optim.compile=false "
+                "runs it as it is."
+            ) from error
         losses = {key: value for key, value in terms.items() if key.startswith("loss")}
         check_finite(losses, "loss")
         self.steps.optimizer.zero_grad()

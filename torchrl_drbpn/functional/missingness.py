@@ -59,7 +59,7 @@ def draw_mechanism(
     if not 0.0 <= share <= 1.0 or (count := max(1, round(share * obs_dim))) >= obs_dim:
         raise ValueError(
             "`always_observed` must be a share that leaves an entry that can go missing, got "
-            f"{share} of {obs_dim} entries: of a single entry MCAR alone can be asked."
+            f"{share} of {obs_dim} entries. Pass a smaller one, or MCAR where there is one entry."
         )
     always = torch.zeros(obs_dim, dtype=torch.bool)
     always[torch.randperm(obs_dim, generator=generator)[:count]] = True

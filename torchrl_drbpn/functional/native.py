@@ -183,9 +183,8 @@ class _Call:
         empty = any(n < 1 for n in (batch, time, obs, state, actions, *widths))
         if size > _MAX_SIZE or len(widths) > _MAX_LAYERS + 1 or empty:
             raise ValueError(f"no size may be 0, none factorised over {_MAX_SIZE}; got {shapes}.")
-        library = _library()
-        if isinstance(library, str):
-            raise RuntimeError(f"the native filter cannot run: {library}.")
+        if (reason := native_status()) is not None:
+            raise RuntimeError(f"the native filter cannot run: {reason}.")
         numbers = [
             batch, time, obs, state, actions, len(widths) - 1, residual, not tanh, R.ndim == 2,
             state, self.information, self.propagated, *widths[1:],
