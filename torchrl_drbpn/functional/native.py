@@ -26,7 +26,7 @@ _KINDS = {torch.float32: "float", torch.float64: "double"}
 _WIDTHS = {"AVX512": "avx512", "AVX2": "avx2"}
 _MAX_SIZE = 64  # the batched factorisation keeps a group of matrices in cache up to here
 _MAX_LAYERS = 15
-_GROUP = 8  # rows that C factorises side by side
+_GROUP = 8  # rows that C factorises side by side, at most
 _TENSORS = 17  # arguments of the operator before the network's layers
 
 
