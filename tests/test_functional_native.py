@@ -17,12 +17,24 @@ from torch.autograd import forward_ad
 from torch.backends.cpu import get_cpu_capability
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from torchrl_drbpn import BeliefFilter
 from torchrl_drbpn.functional import StateSpace, filter_sequence, filtering, native
 
 operator = torch.ops.torchrl_drbpn.filter_rows
 ROOT = Path(__file__).parents[1]
 WIDTHS = ast.literal_eval(re.search("^WIDTHS = (.*)$", (ROOT / "setup.py").read_text(), re.M)[1])
-NARROWER = {"AVX512": ["avx2", "baseline"], "AVX2": ["baseline"]}  # than what the processor has
+
+
+def libraries(monkeypatch):
+    """Put every library that the processor runs in the place of its own, in turn."""
+    wide = {"AVX512": 3, "AVX2": 2}.get(get_cpu_capability(), 1)
+    for name in list(WIDTHS)[:wide]:
+        (path,) = ROOT.glob(f"torchrl_drbpn/_native_{name}.*")
+        library = native.load(path)
+        native._tape_of_a_group.cache_clear()
+        monkeypatch.setattr(native, "_library", lambda library=library: library)
+        yield library
+    native._tape_of_a_group.cache_clear()
 
 
 @built
@@ -238,15 +250,24 @@ def test_no_width_of_vectors_is_taken_apart_by_the_compiler(flags, tmp_path):
 @built
 @pytest.mark.parametrize("propagated", [False, True], ids=["constant", "propagated"])
 @pytest.mark.parametrize("obs", [3, 9])
-def test_libraries_of_narrower_vectors_say_the_same(obs, propagated, monkeypatch):
+def test_the_libraries_of_all_widths_say_the_same(obs, propagated, monkeypatch):
     problem = Problem(5, obs, batch=3, time=5, stored=True, propagated=propagated)
-    for path in ROOT.glob("torchrl_drbpn/_native_*"):
-        if any(width in path.name for width in NARROWER.get(get_cpu_capability(), [])):
-            library = native.load(path)
-            native._tape_of_a_group.cache_clear()
-            monkeypatch.setattr(native, "_library", lambda library=library: library)
-            assert_same(problem, problem.library("native"), problem.library("pytorch"), 1e-9)
-    native._tape_of_a_group.cache_clear()
+    for _ in libraries(monkeypatch):
+        assert_same(problem, problem.library("native"), problem.library("pytorch"), 1e-9)
+
+
+@built
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+def test_what_was_compiled_for_another_library_is_not_taken_from_the_disk(monkeypatch, tmp_path):
+    """A cached graph holds how long the tape is, and differs where another library is installed."""
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    belief_filter, g = BeliefFilter(5, 1), torch.Generator().manual_seed(0)
+    start, action, x = (torch.randn(*n, generator=g) for n in ((3, 5), (3, 7, 1), (3, 7, 5)))
+    given = (start, None, action, x, x > 0, torch.zeros(3, 7, dtype=torch.bool))
+    for _ in libraries(monkeypatch):
+        torch._dynamo.reset()
+        found = torch.compile(belief_filter, fullgraph=True)(*given)
+        assert_equal(found[0], belief_filter(*given)[0], 1e-5)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")

@@ -8,6 +8,7 @@ hand over a pointer to ``csrc/filter.h``.
 import ctypes
 import functools
 import itertools
+import zlib
 from collections.abc import Sequence
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
@@ -52,6 +53,7 @@ def load(path: Path) -> ctypes.CDLL | str:
         return f"{path.name} cannot be loaded: {error}"
     if getattr(library, "abi_float", int)() != _ABI:  # one without the number has none
         return f"{path.name} is of another version than the Python beside it: run pip install -e ."
+    library.build = zlib.crc32(path.read_bytes())  # type: ignore[attr-defined]
     return library
 
 
@@ -65,6 +67,12 @@ def native_status() -> str | None:
     """
     library = _library()
     return library if isinstance(library, str) else None
+
+
+@torch.compiler.assume_constant_result
+def _build() -> int:
+    """Return a number of the library: what torch.compile keeps on disk holds its tape's length."""
+    return getattr(_library(), "build", 0)
 
 
 def unsupported_reason(
@@ -125,7 +133,7 @@ def operator_arguments(model: StateSpace) -> tuple[Any, ...]:
     return (
         model.constant_cov(), model.full_initial_cov(), model.emission_cov, model.emission_matrix,
         model.action_matrix, model.emission_offset, model.initial_mean, model.transition_jacobian,
-        list(layers), f.residual, f.activation == "tanh",
+        list(layers), f.residual, f.activation == "tanh", _build(),
     )  # fmt: skip
 
 
@@ -148,7 +156,7 @@ class _Call:
 
     def __init__(self, arguments: Sequence[Any]) -> None:
         observation, _, action, _, use_stored, stored, start, stored_cov, cov, *_ = arguments
-        R, (F, layers, residual, tanh) = arguments[11], arguments[_TENSORS - 1 :]
+        R, (F, layers, residual, tanh, _) = arguments[11], arguments[_TENSORS - 1 :]
         if observation.ndim != 3 or action.ndim != 3 or start.ndim != 2:
             raise ValueError(
                 "`observation` and `action` must be (batch, time, n), `start` (batch, n)."
@@ -300,11 +308,11 @@ class _Filter(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, residual: bool, tanh: bool, *tensors: Tensor | None
+        ctx: Any, residual: bool, tanh: bool, build: int, *tensors: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        layers, ctx.flags = list(tensors[_TENSORS:]), (residual, tanh)
+        layers, ctx.flags = list(tensors[_TENSORS:]), (residual, tanh, build)
         output = torch.ops.torchrl_drbpn.filter_rows_forward(
-            *tensors[:_TENSORS], layers, residual, tanh
+            *tensors[:_TENSORS], layers, *ctx.flags
         )
         ctx.save_for_backward(output[2], *tensors)
         ctx.mark_non_differentiable(*output[2:])
@@ -320,11 +328,11 @@ class _Filter(torch.autograd.Function):
             )
             stored = None if saved[5] is None else by.pop(0)
             sequence = (x, None, action, None, None, stored, by[0], None, None)
-            return None, None, *sequence, *by[1:8], None, *by[8:]
+            return None, None, None, *sequence, *by[1:8], None, *by[8:]
         # A tensor may be there twice: each place has a gradient of its own.
         saved = [None if x is None else x.view_as(x) for x in saved]
         (Q, P0, R, H, B, d, m0, F), layers = saved[9:_TENSORS], saved[_TENSORS:]
-        residual, tanh = ctx.flags
+        residual, tanh, _ = ctx.flags
         f = TransitionMLP(
             tuple(layers[::2]), tuple(layers[1::2]), residual, "tanh" if tanh else "relu"
         )
@@ -337,7 +345,7 @@ class _Filter(torch.autograd.Function):
             values, wanted, weights, create_graph=True, allow_unused=True
         )
         found = {id(x): g for x, g in zip(wanted, gradients, strict=True)}
-        return None, None, *(found.get(id(x)) for x in saved)
+        return None, None, None, *(found.get(id(x)) for x in saved)
 
 
 def _differentiable(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -368,7 +376,8 @@ def _vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor
 _ARGUMENTS = (
     "Tensor observation, Tensor observed, Tensor action, Tensor reset, Tensor? use_stored, "
     "Tensor? stored, Tensor start, Tensor? stored_cov, Tensor? cov, Tensor Q, Tensor P0, Tensor R, "
-    "Tensor H, Tensor B, Tensor d, Tensor m0, Tensor? F, Tensor[] layers, bool residual, bool tanh"
+    "Tensor H, Tensor B, Tensor d, Tensor m0, Tensor? F, Tensor[] layers, bool residual, "
+    "bool tanh, int build"
 )
 _LIBRARY: Any = torch.library.Library("torchrl_drbpn", "DEF")  # type: ignore[no-untyped-call]
 # The second is the first without its derivative. (torch.library.register_autograd would make the
