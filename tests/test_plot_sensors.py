@@ -15,9 +15,8 @@ from evaluation.sensor_choice import kept_sensors, learned_sensors
 from evaluation.trained import load_trained_agent
 from matplotlib.image import imread
 from omegaconf import OmegaConf
-from recipe_tools import CONF, refused
+from recipe_tools import CONF, make_config, refused
 from tensordict import TensorDict
-from training.config import choice
 from training.sensors import named_sensors, sensor_groups, sensor_names
 
 from torchrl_drbpn import BeliefFilterModule, GaussianTransition, LinearGaussianEmission, functional
@@ -203,7 +202,7 @@ def test_every_component_of_a_task_has_a_name_of_its_own(task, version):
 
 def test_all_tasks_of_the_recipe_have_names_in_both_versions():
     names = {path.stem for path in (CONF / "env").glob("*.yaml")} - {"gym", "torchrl"}
-    tasks = {choice("env", name).id for name in names}
+    tasks = {make_config(f"env={name}").env.id for name in names}
     assert set(TASKS) == {(task, version) for task in tasks for version in ("v4", "v5")}
 
 
