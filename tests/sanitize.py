@@ -16,7 +16,8 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-FLAGS = "-O1 -g -fno-omit-frame-pointer -fsanitize=address,undefined -fno-sanitize-recover=all"
+FLAGS = "-O1 -g -march=native -fno-omit-frame-pointer "
+FLAGS += "-fsanitize=address,undefined -fno-sanitize-recover=all"
 
 
 def main():
@@ -27,6 +28,7 @@ def main():
         for name in ("torchrl_drbpn", "tests"):
             skip = shutil.ignore_patterns("__pycache__", "_native_*")
             shutil.copytree(ROOT / name, copy / name, ignore=skip)
+        shutil.copy(ROOT / "setup.py", copy)
         (copy / "tests" / "conftest.py").unlink()  # it would build the ordinary library
         sources = [ROOT / f"torchrl_drbpn/csrc/filter_{kind}.c" for kind in ("float", "double")]
         built = copy / "torchrl_drbpn" / "_native_baseline.so"

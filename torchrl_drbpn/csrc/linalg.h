@@ -4,7 +4,13 @@
  * ones. Small matrices that differ from row to row are handled LANES at a time: entry (i, j) of
  * LANES matrices is one vector, so that the textbook loops are the vectorised ones.
  */
-#define BYTES __BIGGEST_ALIGNMENT__ /* a vector of the processor; wider ones would lie in memory */
+#if defined(__AVX512F__) /* a vector of the processor; wider ones would lie in memory */
+#define BYTES 64
+#elif defined(__AVX__)
+#define BYTES 32
+#else
+#define BYTES 16
+#endif
 #define LANES ((long)(BYTES / sizeof(real)))
 #define BLOCK 4
 typedef real vec __attribute__((vector_size(BYTES), aligned(sizeof(real)), may_alias));
