@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import shutil
 from functools import partial
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -21,8 +22,8 @@ SIZES = [
     pytest.param(4, 4, id="state=obs"),
     pytest.param(6, 3, id="state>obs"),
 ]
-
 built = pytest.mark.skipif(F.native_status() is not None, reason="not built")
+compiles = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 FORMS = ["pytorch", pytest.param("native", marks=built), "step by step"]
 TOLERANCE = 1e-10
 

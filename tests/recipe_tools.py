@@ -24,8 +24,6 @@ CONF = ROOT / "conf"
 # Every belief module of the recipe, found on disk: a new one is tested without an edit here.
 BELIEFS = sorted(path.stem for path in (CONF / "belief").glob("*.yaml"))
 
-compiles = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
-
 TIMES = ("steps_per_second", "wall_time")
 TABLES = ("metrics.csv", "episodes.csv", "evaluation.csv")
 # A run of seconds with a fifth of its entries missing.

@@ -44,6 +44,11 @@ def test_what_is_composed_is_built(words):
     assert data["normalized_observation"].isfinite().all()
 
 
+def test_a_task_says_how_wide_actions_start_and_the_command_line_wins():
+    words = (["env=hopper"], ["env=ant"], ["env=halfcheetah"], ["env=ant", "heads.log_std=-1"])
+    assert [make_config(*w).heads.log_std for w in words] == [0.0, -0.5, -0.5, -1]
+
+
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)
 def test_every_default_is_explained_on_its_line_or_above(path):
     structure = ("defaults:", "hydra:", "_target_:", "_partial_:", "name:", "- ", "in_keys:")

@@ -13,7 +13,8 @@ import save_agent
 import torch
 from evaluation.trained import WEIGHTS, load_trained_agent
 from evaluation_tools import ROOT, configured, evaluate
-from recipe_tools import compiles, printed, refused
+from filter_problems import compiles
+from recipe_tools import printed, refused
 
 DEPLOY = ROOT / "docs" / "deploy"
 WALKER = ROOT / "agents" / "walker2d"

@@ -12,7 +12,7 @@ from platform import machine, system
 
 import pytest
 import torch
-from filter_problems import Problem, assert_equal, assert_same, built, recording
+from filter_problems import Problem, assert_equal, assert_same, built, compiles, recording
 from torch.autograd import forward_ad
 from torch.backends.cpu import get_cpu_capability
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -259,7 +259,7 @@ def test_the_libraries_of_all_widths_say_the_same(obs, propagated, monkeypatch):
 
 
 @built
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+@compiles
 def test_what_was_compiled_for_another_library_is_not_taken_from_the_disk(monkeypatch, tmp_path):
     """A cached graph holds how long the tape is, and differs where another library is installed."""
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))

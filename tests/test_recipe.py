@@ -10,6 +10,7 @@ import pytest
 import recipe_tools
 import torch
 from evaluation.trained import evaluate_training
+from filter_problems import compiles
 from ppo_drbpn import collect, train_rollout
 from recipe_tools import SMOKE, assembled, assert_same_run, differences, read_table, refused, run
 from suites import saved
@@ -120,7 +121,7 @@ def test_a_missing_compiler_is_one_line(monkeypatch):
         assembled(*SMOKE, "optim.compile=true")
 
 
-@recipe_tools.compiles
+@compiles
 def test_a_loss_that_cannot_be_compiled_is_one_line():
     line = "`optim.compile=true`: the compiled loss failed: .*optim.compile=false"
     with torch.compiler.set_stance("fail_on_recompile"):

@@ -15,7 +15,8 @@ import ppo_drbpn
 import pytest
 import recipe_tools
 import torch
-from recipe_tools import SMOKE, assert_same_run, compiles, read_table, refused, resume, run
+from filter_problems import compiles
+from recipe_tools import SMOKE, assert_same_run, read_table, refused, resume, run
 from training.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from training.errors import UserError
 from training.run_folder import Table, read_config
