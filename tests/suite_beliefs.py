@@ -108,20 +108,6 @@ class BeliefModuleSuite(BeliefModuleRefusals):
         assert out.batch_size == (*shape, 12)
         self.assert_same(module, out.reshape(count, 12), rollout)
 
-    def test_a_row_goes_on_from_the_state_stored_at_its_first_step(self):
-        module = self.make_module(dtype=torch.float64)
-        frames = self.make_frames((2, 9), torch.float64)
-        frames["is_init"][:, 0] = True
-        rollout = self.one_by_one(module, frames, None)[:, 5:]
-        self.assert_same(module, self.as_sequence(module, rollout), rollout)
-        # and the state matters: another one gives another belief
-        other = rollout.clone()
-        for key in self.state_keys(module):
-            if other[key].is_floating_point():
-                other[key] += 1.0
-        features = self.as_sequence(module, other)["features"][:, 0]
-        assert not torch.allclose(features, rollout["features"][:, 0])
-
     def test_is_init_with_an_older_age_joins_slices_over_time_and_resets_one_step_at_a_time(self):
         # two slices of one episode in one row, as TorchRL's SliceSampler lays them out
         module = self.make_module(dtype=torch.float64)
@@ -331,7 +317,7 @@ class BeliefModuleSuite(BeliefModuleRefusals):
 
     def test_the_content_of_a_missing_entry_changes_neither_values_nor_gradient(self):
         found = []
-        for junk in (0.0, 7.0, float("nan"), float("inf")):
+        for junk in (0.0, 1e30, float("nan"), float("inf")):
             module = self.make_module(dtype=torch.float64)
             data = self.one_by_one(module, self.make_frames((3, 5), torch.float64), None)
             data["observation"] = torch.where(data["observed"], data["observation"], junk)

@@ -5,8 +5,6 @@ import functools
 import pytest
 import torch
 from filter_problems import by_hand
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from small_agents import make_filter as make_any_filter
 from suites import ACTION, OBS, BeliefModuleSuite
 from tensordict import TensorDict
@@ -244,59 +242,3 @@ def test_autocast_leaves_the_filter_in_its_own_dtype():
         for found, expected in zip(run(True, over_time), run(False, over_time), strict=True):
             assert found.dtype == torch.float32
             assert torch.equal(found, expected)
-
-
-CASES = {
-    "obs": st.integers(1, 6),
-    "state": st.integers(1, 6),
-    "action": st.integers(1, 3),
-    "batch": st.lists(st.integers(1, 3), max_size=2).map(tuple),
-    "time": st.integers(1, 5),
-    "share": st.sampled_from([0.0, 0.3, 1.0]),
-    "dtype": st.sampled_from([torch.float32, torch.float64]),
-    "seed": st.integers(0, 999),
-}
-
-
-def draw_case(obs, state, action, batch, time, share, dtype, seed):
-    """A module, and trajectories that begin in mid-episode with resets inside."""
-    g = torch.Generator().manual_seed(seed)
-    module = BeliefFilterModule(make_any_filter(obs, action, dtype, state))
-    data = with_state(make_frames((*batch, time), dtype, seed, obs, action), state)
-    data["observed"] = torch.rand(*data.shape, obs, generator=g) < share
-    data["is_init"] = torch.rand(*data.shape, 1, generator=g) < 0.2
-    data["recurrent", "age"].masked_fill_(data["is_init"], 0)
-    return module, data
-
-
-@settings(max_examples=25, deadline=None, derandomize=True, database=None)
-@given(**CASES)
-def test_a_trajectory_is_its_steps_one_after_the_other(**case):
-    module, data = draw_case(**case)
-    with set_recurrent_mode(True), torch.no_grad():
-        whole = module(data.clone())
-    mean = data["recurrent", "mean"][..., 0, :]
-    limit = 1e-10 if case["dtype"] == torch.float64 else 1e-4
-    for t in range(case["time"]):
-        step = data[..., t].clone().set(("recurrent", "mean"), mean)
-        with torch.no_grad():
-            module(step)
-        mean = step["next", "recurrent", "mean"]
-        for key in module.out_keys[:3]:
-            expected = whole[key].select(len(case["batch"]), t)
-            torch.testing.assert_close(step[key], expected, rtol=limit, atol=10 * limit)
-            assert step[key].dtype == case["dtype"]
-
-
-@settings(max_examples=25, deadline=None, derandomize=True, database=None)
-@given(**CASES, junk=st.sampled_from([float("nan"), float("inf"), 1e30]))
-def test_what_did_not_arrive_is_not_read_and_nothing_costs_nothing(junk, **case):
-    module, data = draw_case(**case)
-    spoilt = data.clone()
-    spoilt["observation"] = torch.where(data["observed"], data["observation"], junk)
-    with set_recurrent_mode(True), torch.no_grad():
-        expected, received = module(data), module(spoilt)
-    for key in module.out_keys:
-        assert torch.equal(received[key], expected[key])
-    nothing = ~data["observed"].any(-1)
-    assert not received["belief", "log_likelihood"][nothing].any()

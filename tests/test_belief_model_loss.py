@@ -49,7 +49,6 @@ def counted(data):
 
 class TestSuite(LossSuite):
     has_networks = False
-    reductions = ("none", "mean", "sum")
 
     def make_loss(self, **kwargs):
         return BeliefModelLoss(**kwargs)

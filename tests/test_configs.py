@@ -69,7 +69,6 @@ def composed(*overrides):
 
 def test_a_trainer_of_torchrls_nodes_and_ours_trains(monkeypatch):
     monkeypatch.syspath_prepend(GUIDE)
-    torch.manual_seed(0)
     trainer = instantiate(composed("gaps.eta=0.5", "loss.model_coeff=0.3").trainer)
     loss = trainer.loss_module
     kinds = [type(transform) for transform in trainer.collector.env.transform]

@@ -3,9 +3,8 @@
 import functools
 
 import pytest
-import references
 import torch
-from filter_problems import built, recording
+from filter_problems import built, by_hand, recording
 from refusals import refuses
 from small_agents import ACTION, OBS, TIME, add_advantages, collect, make_agent, make_filter
 from suites import LossSuite
@@ -207,35 +206,18 @@ def test_a_detached_belief_learns_from_the_model_alone():
 def counted(agent, data):
     """Log-likelihood of every received observation, and entries, from the row-deleting oracle."""
     model = agent.belief.filter
-    f = model.transition.mean_network()
-    transition = references.mean_network(list(f.weights), list(f.biases), f.residual, f.activation)
-    H, R, Q = model.emission.matrix, model.emission.cov(), model.transition.cov()
-    F = model.mean_jacobian if model.covariance == "propagated" else None
     total, entries = torch.zeros((), dtype=torch.float64), 0
-
-    def receive(belief, frame):
-        nonlocal total, entries
-        action = frame["previous_action"].to(torch.float64)
-        offset = model.emission.action_matrix @ action + model.emission.offset
-        step = (*belief, frame["observation"], frame["observed"], H, R, offset)
-        total = total + references.log_likelihood(*step)
-        entries += int(frame["observed"].sum())
-        return references.update(*step)
-
-    def move(belief, frame):
-        mean, cov = belief  # what is propagated is a constant of the gradient
-        action = frame["previous_action"].to(torch.float64)
-        return references.predict(mean, cov.detach(), transition, Q, action, F)
-
     for row in data.unbind(0):
-        belief = None
+        frames = []
         for t, frame in enumerate(row.unbind(0)):
-            if frame["is_init"]:
-                belief = receive((model.initial_mean, model.initial_cov), frame)
-            elif t == 0:
-                stored = (frame["recurrent", "mean"], frame.get(("recurrent", "cov"), Q))
-                belief = receive(move(stored, frame), frame)
-            belief = receive(move(belief, frame["next"]), frame["next"])
+            frames += [frame] if t == 0 or frame["is_init"] else []
+            frames.append(frame["next"])
+        names = ("previous_action", "observation", "observed", "is_init")
+        action, x, seen, start = (torch.stack([f[n] for f in frames])[None] for n in names)
+        stored = row[:1]["recurrent"]
+        inputs = (action.double(), x, seen, start.squeeze(-1))
+        out = by_hand(model, stored["mean"], stored.get("cov", None), *inputs)
+        total, entries = total + out.log_likelihood.sum(), entries + int(seen.sum())
     return total, entries
 
 

@@ -47,7 +47,6 @@ def sliced(data, length=SLICE, slices=40):
 
 @pytest.mark.parametrize("own_gae", [False, True], ids=["gae of the trainer", "own gae"])
 def test_it_trains_inside_ppotrainer(own_gae):
-    torch.manual_seed(0)
     loss = make_loss()
     before = {name: p.detach().clone() for name, p in loss.named_parameters()}
     options = {"frames_per_batch": FRAMES, "auto_register_policy_transforms": True}

@@ -57,7 +57,6 @@ def test_a_seed_is_used_once_and_may_be_given_to_reset(backend):
 
 
 def test_the_global_generators_are_left_alone(backend):
-    torch.manual_seed(0)
     np.random.seed(0)
     expected = torch.get_rng_state(), np.random.get_state()[1].copy()
     env = backend("Swimmer-v5", 2)
@@ -99,7 +98,6 @@ def test_a_partial_reset_touches_only_the_rows_asked_for_which_get_the_whole_tim
 
 def test_the_time_limit_truncates_and_leaves_the_true_last_observation(backend):
     env = backend("HalfCheetah-v5", 2, seed=0, dtype=torch.float64, max_episode_steps=4)
-    torch.manual_seed(0)  # of the actions
     rollout = env.rollout(9, break_when_any_done=False)
     ends = rollout["next", "truncated"][0, :, 0]
     assert ends.nonzero().flatten().tolist() == [3, 7]

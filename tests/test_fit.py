@@ -149,7 +149,6 @@ def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself():
     system = references.random_system(3, 4, seed=1)
     train, held = sequences(system, 40, 64), sequences(system, 40, 64, seed=4)
     data = [x._replace(previous_action=1e3 * x.previous_action) for x in (train, held)]
-    torch.manual_seed(0)
     transition = GaussianTransition(3, 2, hidden_sizes=[], residual=False)
     belief_filter = BeliefFilter(4, 2, 3, transition=transition)
     before = per_entry(run(belief_filter, data[1]), data[1]).item()
@@ -166,7 +165,6 @@ def test_a_linear_filter_nearly_reaches_the_likelihood_of_the_system_itself():
 def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it():
     system = references.random_system(3, 4, seed=1)
     train, held = sequences(system, 2, 8), sequences(system, 20, 16, seed=4)
-    torch.manual_seed(0)
     belief_filter = BeliefFilter(4, 2, 3)
     options = {"length": 8, "batch_size": 8, "max_grad_norm": 10.0, "weight_decay": 0.0}
     options |= {"steps": 100, "lr": 0.02, "patience": 5, "seed": 0}
@@ -180,7 +178,6 @@ def test_the_weights_of_the_best_epoch_stay_and_patience_is_the_end_of_it():
 
 def test_windows_start_from_the_beliefs_and_the_jacobian_of_the_whole_sequences(monkeypatch):
     data = sequences(references.random_system(3, 4), 2, 12)
-    torch.manual_seed(0)
     belief_filter = BeliefFilter(4, 2, 3, covariance="propagated")
     calls = []
 

@@ -31,17 +31,6 @@ def draw(samples, obs, seed=0, missing=0.4, dtype=torch.float64):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_masked_moments_are_those_of_the_observed_values_alone(seed):
-    value, observed = draw(50, 4, seed)
-    moments = masked_moments(value, observed)
-    for i in range(4):
-        kept = value[observed[:, i], i]
-        assert moments.n[i] == len(kept)
-        torch.testing.assert_close(moments.mean[i], kept.mean(), **TIGHT)
-        torch.testing.assert_close(moments.var[i], torch.var(kept, correction=0), **TIGHT)
-
-
-@pytest.mark.parametrize("seed", range(3))
 def test_merging_gives_the_same_in_any_order_and_grouping(seed):
     value, observed = draw(97, 3, seed)
     whole = masked_moments(value, observed)

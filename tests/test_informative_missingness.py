@@ -140,7 +140,6 @@ def test_gradients_agree_with_finite_differences_at_a_slope_of_zero_too():
 
 @pytest.mark.parametrize("covariance", ["constant", "propagated"])
 def test_the_module_learns_it_by_the_model_loss_and_steps_are_the_sequence(covariance):
-    torch.manual_seed(0)
     belief_filter = BeliefFilter(3, 2, mask_model=True, covariance=covariance, dtype=torch.float64)
     with torch.no_grad():
         belief_filter.mask_model.copy_(torch.randn(2, 3))

@@ -47,39 +47,37 @@ def make_networks():
 
 @pytest.mark.parametrize("missing", ["zero", "keep"])
 def test_sac_learns_from_corrupted_observations(missing):
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        filling = [FillLastObserved(fill_value=float("nan"))] if missing == "keep" else []
-        norm = MaskedObservationNorm(OBS, missing=missing)
-        actor, qvalue = make_networks()
-        loss = SACLoss(actor, qvalue, num_qvalue_nets=2, target_entropy=-float(ACTION))
-        loss.make_value_estimator(gamma=0.99)
-        target = SoftUpdate(loss, eps=0.99)
-        optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
-        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), batch_size=32)
-        before = [parameter.detach().clone() for parameter in actor.parameters()]
-        sizes = {"frames_per_batch": FRAMES, "total_frames": BATCHES * FRAMES}
-        policy = TensorDictSequential(norm, actor)
-        options = sizes | {"auto_register_policy_transforms": False}
-        collector = Collector(make_env(filling), policy, **options)
-        losses = []
-        try:
-            for data in collector:
-                norm.update(data)
-                buffer.extend(data.reshape(-1))
-                for _ in range(4):
-                    sample = buffer.sample()
-                    norm(sample)
-                    norm(sample["next"])
-                    out = loss(sample)
-                    total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
-                    optimizer.zero_grad()
-                    total.backward()
-                    optimizer.step()
-                    target.step()
-                    losses.append(total.detach())
-        finally:
-            collector.shutdown()
+    filling = [FillLastObserved(fill_value=float("nan"))] if missing == "keep" else []
+    norm = MaskedObservationNorm(OBS, missing=missing)
+    actor, qvalue = make_networks()
+    loss = SACLoss(actor, qvalue, num_qvalue_nets=2, target_entropy=-float(ACTION))
+    loss.make_value_estimator(gamma=0.99)
+    target = SoftUpdate(loss, eps=0.99)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), batch_size=32)
+    before = [parameter.detach().clone() for parameter in actor.parameters()]
+    sizes = {"frames_per_batch": FRAMES, "total_frames": BATCHES * FRAMES}
+    policy = TensorDictSequential(norm, actor)
+    options = sizes | {"auto_register_policy_transforms": False}
+    collector = Collector(make_env(filling), policy, **options)
+    losses = []
+    try:
+        for data in collector:
+            norm.update(data)
+            buffer.extend(data.reshape(-1))
+            for _ in range(4):
+                sample = buffer.sample()
+                norm(sample)
+                norm(sample["next"])
+                out = loss(sample)
+                total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
+                optimizer.zero_grad()
+                total.backward()
+                optimizer.step()
+                target.step()
+                losses.append(total.detach())
+    finally:
+        collector.shutdown()
 
     assert torch.stack(losses).isfinite().all()
     assert any((p != old).any() for p, old in zip(actor.parameters(), before, strict=True))

@@ -82,7 +82,6 @@ class Own(nn.Module):
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("hidden", [(), (7,), (7, 5), (7, 5, 6)], ids=len)
 def test_the_closed_form_jacobian_is_that_of_autograd(hidden, activation, residual):
-    torch.manual_seed(0)
     transition = GaussianTransition(
         3, 2, hidden_sizes=hidden, activation=activation, residual=residual, dtype=torch.float64
     )
@@ -94,7 +93,6 @@ def test_the_closed_form_jacobian_is_that_of_autograd(hidden, activation, residu
 
 
 def test_a_fresh_filter_sets_its_jacobian_once_and_it_is_saved_with_it():
-    torch.manual_seed(0)
     filter, data = BeliefFilter(5, 2, 3, covariance="propagated").double(), sequences(3, (4,))
     inputs = data._replace(mean=0 * data.mean, cov=torch.zeros(4, 3, 3).double())
     first = filter(*inputs)
@@ -127,7 +125,6 @@ def test_a_fresh_filter_sets_its_jacobian_once_and_it_is_saved_with_it():
 @pytest.mark.parametrize("own", [False, True], ids=["ours", "another"])
 @pytest.mark.parametrize("jacobian", ["mean", "row"])
 def test_a_filter_propagates_by_the_jacobian_of_its_transition(jacobian, own):
-    torch.manual_seed(0)
     options = {"covariance": "propagated", "jacobian": jacobian}
     filter = BeliefFilter(5, 2, 3, transition=Own(3) if own else None, **options).double()
     f = lambda m, a: filter.transition(m, a)[0]  # noqa: E731

@@ -60,17 +60,16 @@ def test_its_entry_holds_the_keys_that_its_target_takes(belief):
 @pytest.mark.parametrize("belief", [*BELIEFS, "drbpn heads.critic_input=complete"])
 def test_a_run_learns_and_goes_on_from_its_files_to_the_last_bit(belief):
     words = ("experiment=smoke", *f"belief={belief}".split())
-    with torch.random.fork_rng():
-        whole, config = assembled(*words)
-        start = [p.detach().clone() for p in whole.agent.parameters()]
-        train_rollout(whole, config)
-        state = saved(whole.state_dict())
-        row, _ = train_rollout(whole, config)
-        expected = saved(whole.state_dict())
-        resumed, _ = assembled(*words)
-        resumed.load_state_dict(state, "here")
-        train_rollout(resumed, config)
-        received = saved(resumed.state_dict())
+    whole, config = assembled(*words)
+    start = [p.detach().clone() for p in whole.agent.parameters()]
+    train_rollout(whole, config)
+    state = saved(whole.state_dict())
+    row, _ = train_rollout(whole, config)
+    expected = saved(whole.state_dict())
+    resumed, _ = assembled(*words)
+    resumed.load_state_dict(state, "here")
+    train_rollout(resumed, config)
+    received = saved(resumed.state_dict())
     assert differences(expected, received) == []
     columns = metric_columns(whole.agent.summary())
     assert len(set(columns)) == len(columns)
@@ -93,12 +92,11 @@ def test_only_gru_action_reads_the_action():
 
 
 def test_filling_holds_the_last_normalised_value_and_the_mean_before_the_first():
-    with torch.random.fork_rng():
-        words = ("experiment=smoke", "belief=fill", "missingness=mcar")
-        training, _ = assembled(*words)
-        training.agent.norm.update(training.collector.rollout())
-        training.start_episodes()
-        data = training.collector.rollout()
+    words = ("experiment=smoke", "belief=fill", "missingness=mcar")
+    training, _ = assembled(*words)
+    training.agent.norm.update(training.collector.rollout())
+    training.start_episodes()
+    data = training.collector.rollout()
     seen, value, start = data["observed"], data["normalized_observation"], data["is_init"]
     held = torch.zeros_like(value[:, 0])  # 0 is the running mean, which raw 0 may be far from
     never = 0
@@ -159,8 +157,7 @@ def test_the_complete_observation_is_what_complete_noiseless_sensors_show(corrup
 
 
 def test_by_default_nothing_complete_is_written():
-    with torch.random.fork_rng():
-        training, _ = assembled("experiment=smoke")
+    training, _ = assembled("experiment=smoke")
     assert "complete_observation" not in training.env.full_observation_spec.keys(True, True)
     assert training.agent.critic.in_keys == ["features"]
 

@@ -4,7 +4,6 @@ from functools import partial
 
 import pytest
 import torch
-from self_resetting import SelfResettingEnv
 from suites import StaircaseEnv
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite
@@ -12,6 +11,20 @@ from torchrl.envs import ActionScaling, Compose, GymEnv, SerialEnv, Transform, T
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_drbpn.transforms import FillLastObserved, ObservationMissingness, PreviousAction
+
+
+class SelfResettingEnv(StaircaseEnv):
+    """A staircase whose step returns the first observation of the next episode where one ends."""
+
+    def __init__(self, batch=3, horizon=3):
+        super().__init__(batch=batch, horizon=horizon)
+        self._torchrl_native_autoreset = True  # as TorchRL's auto-resetting environments say it
+
+    def _step(self, tensordict):
+        data = super()._step(tensordict)
+        ended = data["done"]
+        self.time = self.time.masked_fill(ended.squeeze(-1), 0)
+        return data.set("observation", self._observe()["observation"])
 
 
 def expected_shift(data):

@@ -1,15 +1,14 @@
-"""What a run survives: kills, a full disk, flipped bits, planted files. Longer than the suite.
+"""What a run survives: kills, a full disk, flipped bits. Longer than the suite.
 
 ``python tests/torture.py`` (about 20 minutes on a quiet machine) or ``--quick`` (about one).
 Prints one line a class with its counts, in between what has been tried (on stderr), and leaves with
 status 1 where a count is not as it must be. Classes named go alone, in any order and at any time:
-``python tests/torture.py sweep planted`` draws the moments that the whole run draws for these two.
+``python tests/torture.py sweep`` draws the moments that the whole run draws for it.
 
 kills         50 runs of every belief and algorithm, killed at random moments and resumed
 sweep         8 kills of a sweep and its cells
 full_disk     20 runs of which no file may grow beyond a random size
 flipped_bits  800 flipped bits of a checkpoint
-planted       20 kinds of foreign or damaged files in a run folder
 
 Every run is a process of its own that is killed by SIGKILL at a random moment, resumed, killed
 again, and let go on to its end. It then equals the run that nobody stopped, to the last bit: its
@@ -17,7 +16,6 @@ tables and its last checkpoint. What can't go on says so in one line and leaves 
 """
 
 import argparse
-import functools
 import os
 import random
 import resource
@@ -31,7 +29,7 @@ from collections import Counter
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
-from recipe_tools import DAMAGED, LAST, ROOT, damage, make_config, resume, run, unequal
+from recipe_tools import ROOT, make_config, resume, run, unequal
 from training.checkpoint import checkpoint_frames, last_checkpoint, load_checkpoint
 from training.config import explained
 from training.console import log_line
@@ -242,64 +240,11 @@ def flipped_bits(work, draw, count):
     return wrong
 
 
-def planted(work, draw, count):
-    """Put files into a run folder that do not belong there, and go on with the run."""
-    del draw
-    straight, seed = work / "plant-straight", work / "plant-seed"
-    finished(straight, CASES["none"])
-    shutil.copytree(straight, seed)
-    last_checkpoint(seed).unlink()
-
-    def writes(name, data):
-        return lambda folder: (folder / name).write_bytes(data)
-
-    harmless = {
-        "frames_zzz.pt": writes("checkpoints/frames_zzz.pt", b"\x00\x01"),
-        "a stale temporary": writes("checkpoints/.frames_000000000512.pt.tmp", b"half"),
-        "a stale table": writes(".metrics.csv.1.tmp", b"half"),
-        "half a row": lambda folder: (folder / "metrics.csv").open("a").write("9999,1."),
-        "a lost evaluation": lambda folder: (folder / "evaluation.csv").unlink(),
-    }
-    latest = str(last_checkpoint(seed).relative_to(seed))
-    harmful = {
-        f"{name}: {str(content)[:20]}": functools.partial(
-            damage, name=latest if name == LAST else name, content=content
-        )
-        for name, content, _ in DAMAGED
-    }
-    wrong, refused, ignored = [], 0, 0
-    for number, (name, plant) in enumerate([*harmless.items(), *harmful.items()][:count]):
-        folder = shutil.copytree(seed, work / f"plant-{number}")
-        plant(folder)
-        before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.suffix == ".pt"}
-        process = Process(lambda folder=folder: resume(folder), work / "log")
-        status = process.ends()
-        if name in harmless:
-            different = unequal(straight, folder) if status == 0 else [process.log.read_text()]
-            left = [] if name == "frames_zzz.pt" else [str(p) for p in folder.rglob(".*.tmp*")]
-            # A table that is gone lacks what the checkpoint believes is in it.
-            wanted = ["evaluation.csv"] if name == "a lost evaluation" else []
-            ignored += different + left == wanted
-            wrong += [f"{name}: {line}" for line in different + left if line not in wanted]
-        else:
-            kept = all(p.is_file() and p.read_bytes() == data for p, data in before.items())
-            good = status == 2 and process.is_one_line() and kept
-            refused += good
-            wrong += [] if good else [f"{name}: status {status}\n{process.log.read_text()[-800:]}"]
-        progress(f"planted: {name}, {len(wrong)} wrong so far")
-    log_line(
-        f"planted files: {refused} of {len(harmful)} refused in one line, "
-        f"{ignored} of {len(harmless)} without effect"
-    )
-    return wrong
-
-
 CLASSES = {
     "kills": (kills, 6, 50),
     "sweep": (sweep, 1, 8),
     "full_disk": (full_disk, 2, 20),
     "flipped_bits": (flipped_bits, 100, 400),
-    "planted": (planted, 99, 99),
 }
 
 
