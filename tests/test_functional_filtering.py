@@ -8,7 +8,7 @@ import torch
 from filter_problems import FORMS, SIZES, Problem, assert_equal, assert_same
 from refusals import refuses
 
-from torchrl_drbpn.functional import TransitionMLP, filter_sequence, filter_step, filtered_cov
+from torchrl_drbpn.functional import TransitionMLP, filter_sequence, filter_step
 
 covariances = pytest.mark.parametrize(
     "propagated", [False, True], ids=["constant covariance", "propagated"]
@@ -180,7 +180,7 @@ def test_covariances_are_computed_only_where_asked_for(form):
     assert out.cov is None
     asked = problem.run(form, return_cov=True)
     assert torch.equal(asked.mean, out.mean)
-    assert_equal(asked.cov, filtered_cov(problem.model(), problem.observed, problem.reset))
+    assert_equal(asked.cov, problem.oracle()[1])
 
 
 @covariances
@@ -298,7 +298,7 @@ def run_with_a_weight_of(value):
 def cov_of_a_state_dependent_model():
     problem = Problem(3, 5)
     model = replace(problem.model(), transition_cov=lambda mean, action: mean)
-    filtered_cov(model, problem.observed, problem.reset)
+    model.constant_cov()
 
 
 def run_with_functions(**functions):

@@ -62,23 +62,6 @@ def test_with_fewer_than_two_values_the_spread_is_one(seen):
     assert spread(masked_moments(value, observed), EPS).item() == 1.0
 
 
-def test_other_masks_and_sensors_are_refused():
-    for mask in (torch.ones(4, 2), torch.ones(4).bool()):
-        with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
-            masked_moments(torch.zeros(4, 2), mask)
-    for mask in (torch.ones(4, 1).bool(), torch.ones(4).bool()):
-        with pytest.raises(ValueError, match="`observed` must be bool of the observation's shape"):
-            winsorize(torch.zeros(4, 2), mask, nothing(2), EPS)
-    seen = torch.ones(4, 3).bool()
-    for use in (
-        lambda: merge_moments(nothing(2), nothing(3)),
-        lambda: spread(nothing(2)._replace(var=torch.zeros(3)), EPS),
-        lambda: winsorize(torch.zeros(4, 3), seen, nothing(2), EPS),
-    ):
-        with pytest.raises(ValueError, match=r"one shape \(\*event\).* got \[\(2,\), \(3,\)\]"):
-            use()
-
-
 @pytest.mark.parametrize("missing", [0.0, 0.9])
 @pytest.mark.parametrize("learned", [False, True], ids=["first", "later"])
 def test_readings_of_a_normal_sensor_are_left_as_they_are(missing, learned):

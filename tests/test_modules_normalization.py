@@ -272,6 +272,18 @@ def test_a_collector_in_another_process_is_sent_the_statistics():
     collector.shutdown()
 
 
+def test_nested_keys_are_taken_as_configurations_write_them():
+    agents = [["agents", "observation"], ["agents", "observed"]]
+    out = [["agents", "normalized"]]
+    norm, plain = MaskedObservationNorm(OBS, in_keys=agents, out_keys=out), make_rollout()
+    data = plain.empty().set("agents", plain.select("observation", "observed"))
+    expected = MaskedObservationNorm(OBS)(plain)["normalized_observation"]
+    assert torch.equal(norm(data)["agents", "normalized"], expected)
+    data["agents", "observed"] = torch.ones(4, 25, 1)
+    with pytest.raises(ValueError, match=r"`\('agents', 'observed'\)` must be bool"):
+        norm(data)
+
+
 test_impossible_settings_are_refused = refuses(
     ({"obs_dim": 0}, "`obs_dim` must"),
     ({"clip": -1.0}, "`clip` must"),

@@ -97,6 +97,15 @@ def test_many_particles_are_each_by_hand_over_a_resampled_memory():
     assert died  # resampling did something
 
 
+@pytest.mark.parametrize("name", ["previous_action", "observation"])
+def test_what_is_no_number_is_named(name):
+    filter, data = make_filter(dtype=torch.float64), make_frames((3, 5))
+    data["observed"][:] = True
+    data[name][1, 2] = torch.nan
+    with pytest.raises(ValueError, match=f"`{name}` holds NaN"):
+        run(filter, data)
+
+
 def test_nothing_observed_leaves_the_ratio_of_transition_and_proposal_and_the_mask_is_read():
     filter = make_filter(dtype=torch.float64, num_particles=1)
     data = make_frames((3, 5))

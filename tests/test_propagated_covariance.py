@@ -14,7 +14,6 @@ from torchrl_drbpn.functional import (
     TransitionMLP,
     filter_sequence,
     filter_step,
-    filtered_cov,
 )
 
 
@@ -59,8 +58,6 @@ def test_what_a_propagated_covariance_needs_is_named():
         problem.run("auto", **missing)
     with pytest.raises(ValueError, match=r"`cov` must be float64 of shape .*= \(3, 3, 3\)"):
         problem.run("auto", cov=problem.start_cov[:2])
-    with pytest.raises(ValueError, match="depends on the whole past"):
-        filtered_cov(problem.model(), problem.observed, problem.reset)
     problem.jacobian = torch.eye(2).double()
     with pytest.raises(ValueError, match=r"`transition_jacobian` must have shape \(3, 3\)"):
         problem.model()

@@ -11,7 +11,6 @@ from torchrl_drbpn.functional.filtering import (
     FilterOutput,
     filter_sequence,
     filter_step,
-    filtered_cov,
 )
 from torchrl_drbpn.functional.gaussian import (
     Belief,
@@ -77,7 +76,6 @@ __all__ = [
     "draw_mechanism",
     "filter_sequence",
     "filter_step",
-    "filtered_cov",
     "forecast",
     "full_cov",
     "innovation",

@@ -196,34 +196,6 @@ def _warn_once(reason: str) -> None:
     warnings.warn(f"the filter runs in PyTorch, several times slower: {reason}.", stacklevel=2)
 
 
-def filtered_cov(
-    model: StateSpace, observed: Tensor, reset: Tensor, weight: Tensor | None = None
-) -> Tensor:
-    """Return the filtered covariance of a constant-Q model: of the masks and weights alone.
-
-    .. math:: P^+ = (I - K H) P (I - K H)' + K R K'
-
-    Eq. (10) [DRBPN] in Joseph's form; P is Q, or P_0 where ``reset``, bool ``(*batch,)``, is True.
-    ``observed`` and ``weight`` are those of :func:`filter_sequence`, ``(*batch, obs)``; a
-    ValueError if the model's covariance depends on the past. Shape ``(*batch, state, state)``.
-
-    Example:
-        >>> from torchrl_drbpn import BeliefFilter
-        >>> model = BeliefFilter(obs_dim=2, action_dim=1).state_space()
-        >>> cov = filtered_cov(model, torch.tensor([True, False]), torch.tensor(False))
-        >>> (cov < model.constant_cov()).diagonal().tolist()
-        [True, False]
-    """
-    if model.transition_jacobian is not None or model.mask_model is not None:
-        raise ValueError(
-            "`model` has a covariance that depends on the whole past: ask "
-            "filter_sequence or filter_step for it."
-        )
-    nothing = observed.new_zeros((), dtype=model.initial_mean.dtype)  # only the masks are read
-    rows = FilterInputs(nothing, observed, nothing, reset, None, None, nothing, weight=weight)
-    return _filtered_cov(model, rows, None)
-
-
 def _filtered_cov(model: StateSpace, rows: FilterInputs, filtered: Tensor | None) -> Tensor:
     """Return covariances with the gradient of one step: a propagated one before is a constant."""
     first, F, P = rows.reset[..., None, None], model.transition_jacobian, model.constant_cov()

@@ -2,7 +2,7 @@
 
 import math
 from contextlib import AbstractContextManager, nullcontext
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,11 +22,11 @@ class NotPositiveDefiniteError(ValueError):
     """Report a covariance that has no Cholesky factor."""
 
 
-def check_observed(observation: Tensor, observed: Tensor) -> None:
-    """Refuse a mask that would broadcast or be read as numbers."""
+def check_observed(observation: Any, observed: Any, name: Any = "observed") -> None:
+    """Refuse a mask, or its spec, that would broadcast or be read as numbers."""
     if observed.dtype is not torch.bool or observed.shape != observation.shape:
         raise ValueError(
-            f"`observed` must be bool of the observation's shape {tuple(observation.shape)}, got "
+            f"`{name}` must be bool of the observation's shape {tuple(observation.shape)}, got "
             f"{observed.dtype} {tuple(observed.shape)}. One entry a component: True = arrived."
         )
 

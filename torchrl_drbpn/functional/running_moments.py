@@ -9,8 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional.gaussian import check_observed
-
 # Its square is still a float64.
 _LARGEST = 1e150
 # Learned deviations from the learned mean; beyond them a reading is moved to the bound.
@@ -37,8 +35,8 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMome
     """Compute the moments of the observed entries of a batch, float64; of no entry they are 0.
 
     With `o` the mask: n = sum o,  mean = sum o x / n,  var = sum o (x - mean)^2 / n, each over the
-    first dimension of a value ``(samples, *event)``. ``observed`` is bool of that shape, a
-    ValueError for another; None: all. What lies under a False entry, NaN included, is never used.
+    first dimension of a value ``(samples, *event)``. ``observed`` is bool of that shape; None: all.
+    What lies under a False entry, NaN included, is never used.
 
     Example:
         >>> x = torch.tensor([[1.0], [3.0], [torch.nan]])
@@ -47,7 +45,6 @@ def masked_moments(value: Tensor, observed: Tensor | None = None) -> RunningMome
     """
     if observed is None:
         observed = torch.ones_like(value, dtype=torch.bool)
-    check_observed(value, observed)
     weight = observed.double()
     count = weight.sum(0)
     share = weight / count.clamp_min(1.0)
@@ -63,7 +60,7 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
     With d = mean_b - mean_a and w = n_b / (n_a + n_b):
     mean = mean_a + w d,  var = (1 - w) var_a + w var_b + w (1 - w) d^2.
     Eq. (1.5) of [Chan, Golub, LeVeque 1979, Updating formulae and a pairwise algorithm for
-    computing sample variances], divided by the count. A ValueError for different shapes.
+    computing sample variances], divided by the count.
 
     Example:
         >>> x = torch.randn(9, 2, dtype=torch.float64)
@@ -71,7 +68,6 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
         >>> torch.allclose(split.var, masked_moments(x).var)
         True
     """
-    _check_shapes(*(field.shape for field in (*first, *second)))
     count = first.n + second.n
     # The clamp only meets a count of 0, where the weight is 0 anyway.
     weight = second.n / count.clamp_min(1)
@@ -87,14 +83,11 @@ def merge_moments(first: RunningMoments, second: RunningMoments) -> RunningMomen
 def spread(moments: RunningMoments, eps: float) -> Tensor:
     """Return the deviation sqrt(var + eps), and 1 where fewer than two values were seen.
 
-    A ValueError for moments whose fields have different shapes.
-
     Example:
         >>> x = torch.randn(9, 2, dtype=torch.float64)
         >>> torch.allclose(spread(masked_moments(x), 0.0), x.std(0, correction=0))
         True
     """
-    _check_shapes(*(field.shape for field in moments))
     return torch.where(moments.n < 2, 1.0, (moments.var + eps).sqrt())
 
 
@@ -110,8 +103,7 @@ def winsorize(
     readings nothing is learned, as an outlier among them could not be recognised.
 
     Of readings ``(samples, *event)``, finite where the bool ``observed`` is True, and the moments
-    learned so far it returns the readings, float64, and which of them to learn from. A ValueError
-    for a mask or moments of other sizes.
+    learned so far it returns the readings, float64, and which of them to learn from.
 
     Example:
         >>> nothing = RunningMoments(*torch.zeros(3, 1, dtype=torch.float64))
@@ -119,8 +111,6 @@ def winsorize(
         >>> bool(winsorize(x, torch.ones_like(x) > 0, nothing, 1e-8)[0].max() < 30)
         True
     """
-    check_observed(value, observed)
-    _check_shapes(value.shape[1:], *(field.shape for field in learned))
     value = value.double().masked_fill(~observed, 0.0).clamp(-_LARGEST, _LARGEST)
     known = (learned.n >= _ENOUGH) & (learned.var > eps)
     centre, radius = learned.mean.double(), _WIDTH * learned.var.double().sqrt()
@@ -134,14 +124,6 @@ def winsorize(
         centre = torch.where(known, centre, middle)
         radius = torch.where(known, radius, reach)
     return torch.minimum(torch.maximum(value, centre - radius), centre + radius), observed
-
-
-def _check_shapes(*shapes: torch.Size) -> None:
-    if len(set(shapes)) > 1:
-        raise ValueError(
-            "every field of `RunningMoments` must have the one shape (*event) of the sensors, got "
-            f"{sorted(map(tuple, set(shapes)))}. Are they of different sensors?"
-        )
 
 
 def _gather(value: Tensor, rank: Tensor) -> Tensor:

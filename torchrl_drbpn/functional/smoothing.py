@@ -178,8 +178,7 @@ def _predict(
     elif not isinstance(F, Tensor):
         F = F(mean, action)
     Q, block = model.predicted_cov(mean, action).double(), row.unsqueeze(-1)
-    F = F.double()
-    F = torch.where(block, 0.0, F)
+    F = torch.where(block, 0.0, F.double())
     moved = F @ belief.cov.masked_fill(block, 0.0) @ F.mT
     cov = torch.where(block, model.full_initial_cov().double(), 0.5 * (moved + moved.mT) + Q)
     return Belief(model.predicted_mean(mean, action, row).double(), cov), F, Q

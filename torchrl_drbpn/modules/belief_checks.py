@@ -1,12 +1,15 @@
 """Tell readings that are no numbers from a model that has diverged."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from torchrl_drbpn.functional import FilterOutput
+from torchrl_drbpn.functional import FilterOutput, ParticleOutput
 from torchrl_drbpn.functional.gaussian import NotPositiveDefiniteError
+
+_Output = TypeVar("_Output", FilterOutput, ParticleOutput)
 
 
 class BeliefDivergedError(ValueError):
@@ -14,13 +17,12 @@ class BeliefDivergedError(ValueError):
 
 
 def checked(
-    run: Callable[[], FilterOutput],
+    run: Callable[[], _Output],
     validate: bool,
-    mean: Tensor,
-    previous_action: Tensor,
     observation: Tensor,
     observed: Tensor,
-) -> FilterOutput:
+    **others: Tensor,
+) -> _Output:
     """Filter, and raise if the result is not finite: name the input that caused it."""
     silent = not validate or torch.compiler.is_compiling() or observation.is_meta
     failed: NotPositiveDefiniteError | None = None
@@ -33,14 +35,14 @@ def checked(
     else:
         if silent:
             return out
-        total = out.log_likelihood.detach().sum() + out.mean.detach().sum()
+        total = out.log_likelihood.detach().sum() + out[0].detach().sum()
         try:
             if bool(total.isfinite()):
                 return out
         except RuntimeError:  # under vmap no number reaches the host
             return out
     refuse_readings(observation, observed)
-    for name, value in (("previous_action", previous_action), ("mean", mean)):
+    for name, value in others.items():
         if not bool(torch.isfinite(value).all()):
             raise ValueError(
                 f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "

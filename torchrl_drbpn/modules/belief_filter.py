@@ -71,8 +71,8 @@ class BeliefFilter(nn.Module):
             likelihood is then that of readings and mask, the belief learns from what did not
             arrive, and the filter runs step by step.
         validate: look at values too: a NaN or inf that the mask calls observed raises ValueError.
-            Needs a value on the host, so it is skipped while compiling or exporting; switch it off
-            under ``vmap``.
+            Needs a value on the host, so it is skipped while compiling, while exporting and under
+            ``vmap``; :meth:`smooth` needs it off there.
         device, dtype: of the parameters.
 
     Raises:
@@ -112,11 +112,11 @@ class BeliefFilter(nn.Module):
         super().__init__()
         check_choice("covariance", covariance, ("constant", "propagated"))
         check_choice("jacobian", jacobian, ("mean", "row"))
-        if state_dim is None:
-            given = getattr(transition, "state_dim", None) or getattr(emission, "state_dim", None)
-            state_dim = given or min(check_dim("obs_dim", obs_dim), _MAX_DEFAULT_STATE)
         self.obs_dim = check_dim("obs_dim", obs_dim)
         self.action_dim = check_dim("action_dim", action_dim)
+        if state_dim is None:
+            given = getattr(transition, "state_dim", None) or getattr(emission, "state_dim", None)
+            state_dim = given or min(obs_dim, _MAX_DEFAULT_STATE)
         self.state_dim = check_dim("state_dim", state_dim)
         if not initial_std > _MIN_INITIAL_STD:
             raise ValueError(
@@ -269,7 +269,8 @@ class BeliefFilter(nn.Module):
                 weight = weigh(model, *given, **start, **by)
             return filter(model, *given, **start, weight=weight, return_cov=return_cov)
 
-        return checked(run, self.validate, *given[:4])
+        mean, action, *readings, _ = given
+        return checked(run, self.validate, *readings, previous_action=action, mean=mean)
 
     def forward(
         self,

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -18,6 +18,7 @@ from torchrl_drbpn.functional.running_moments import (
     spread,
     winsorize,
 )
+from torchrl_drbpn.modules.recurrent_belief import as_keys
 
 
 class MaskedObservationNorm(TensorDictModuleBase):
@@ -89,8 +90,8 @@ class MaskedObservationNorm(TensorDictModuleBase):
             raise ValueError(f"`eps` must be positive and finite, got {eps}.")
         if missing not in ("zero", "keep"):
             raise ValueError(f"`missing` must be 'zero' or 'keep', got {missing!r}.")
-        inputs = [unravel_key(key) for key in in_keys]
-        outputs = [unravel_key(key) for key in out_keys]
+        inputs = as_keys("in_keys", in_keys)
+        outputs = as_keys("out_keys", out_keys)
         if len(inputs) not in (1, 2) or len(outputs) != 1:
             raise ValueError(
                 "`in_keys` must name an observation and its mask, or an observation alone, and "
@@ -100,7 +101,7 @@ class MaskedObservationNorm(TensorDictModuleBase):
         self._observed_key = inputs[1] if len(inputs) == 2 else None
         self._complete_keys: tuple[NestedKey, NestedKey] | None = None
         if complete_keys is not None:
-            source, target = (unravel_key(key) for key in complete_keys)
+            source, target = as_keys("complete_keys", complete_keys)
             self._complete_keys = source, target
             inputs.append(source)
             outputs.append(target)
@@ -208,7 +209,7 @@ class MaskedObservationNorm(TensorDictModuleBase):
                 f"dimension, got shape {tuple(value.shape)}. Is it another robot's?"
             )
         if observed is not None:
-            check_observed(value, observed)
+            check_observed(value, observed, self._observed_key)
 
     def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         keys = [key for key in (self._observation_key, self._observed_key) if key is not None]

@@ -1,5 +1,6 @@
 """The networks of deep variational reinforcement learning, and their particle filter on tensors."""
 
+import functools
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from torchrl_drbpn.functional import (
     zero_missing,
 )
 from torchrl_drbpn.functional.gaussian import check_observed
-from torchrl_drbpn.modules.belief_checks import BeliefDivergedError, refuse_readings
+from torchrl_drbpn.modules.belief_checks import checked
 from torchrl_drbpn.modules.state_space import check_dim
 
 _ENTRIES = 1 << 18  # places in the noise table: 1 MB in float32
@@ -164,11 +165,10 @@ class ParticleFilter(nn.Module):
         zeroed = zero_missing(observation, observed)
         seen = self.encoder(torch.cat([zeroed, observed.to(zeroed.dtype)], -1))
         action = self.action_encoder(previous_action)
-        out = particle_sequence(
-            _Networks(self), hidden, log_weight, begin, (seen, action), zeroed, observed, noise
-        )
-        self._check_values(out.log_likelihood, observation, observed)
-        return out
+        given = (hidden, log_weight, begin, (seen, action), zeroed, observed, noise)
+        run = functools.partial(particle_sequence, _Networks(self), *given)
+        others = {"previous_action": previous_action, "hidden": hidden}
+        return checked(run, self.validate, observation, observed, **others)
 
     def step(
         self,
@@ -229,17 +229,6 @@ class ParticleFilter(nn.Module):
         proposal = self.noise_table[place.unsqueeze(-1) + offset]
         shape = (*key.shape, self.num_particles, self.latent_dim)
         return ParticleNoise(proposal.reshape(shape), uniform.unsqueeze(-1))
-
-    def _check_values(self, log_likelihood: Tensor, observation: Tensor, observed: Tensor) -> None:
-        if not self.validate or torch.compiler.is_compiling() or log_likelihood.is_meta:
-            return
-        if bool(torch.isfinite(log_likelihood).all()):
-            return
-        refuse_readings(observation, observed)
-        raise BeliefDivergedError(
-            "the particles are no longer finite although every observed entry is: the learned "
-            "model diverged. Lower the learning rate."
-        )
 
 
 class _Networks(NamedTuple):

@@ -73,7 +73,7 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         if in_key is not None:
             in_keys = {"observation": in_key}
         elif in_keys is not None and not isinstance(in_keys, Mapping):
-            listed = _as_keys("in_keys", in_keys)
+            listed = as_keys("in_keys", in_keys)
             if len(listed) not in (len(_SOURCES), len(names)):
                 raise ValueError(
                     f"`in_keys` must have {len(_SOURCES)} or {len(names)} entries, in the order "
@@ -93,7 +93,7 @@ class RecurrentBeliefModule(TensorDictModuleBase):
                 outputs[0]: outputs[0] if out_key is None else out_key
             }
         elif not isinstance(out_keys, Mapping):
-            listed = _as_keys("out_keys", out_keys)
+            listed = as_keys("out_keys", out_keys)
             out_keys = {key: key for key in listed if key not in self._next}
         self._out = _renamed("out_keys", out_keys, (*outputs, *optional))
         self.in_keys = [key for key in self._in.values() if key is not None]
@@ -215,7 +215,7 @@ class RecurrentBeliefModule(TensorDictModuleBase):
         return TensorDictPrimer(specs, expand_specs=True)
 
 
-def _as_keys(argument: str, given: Sequence[NestedKey | None]) -> list[NestedKey | None]:
+def as_keys(argument: str, given: Sequence[NestedKey | None]) -> list[NestedKey | None]:
     """Return a list of keys; a key may be any sequence of strings, as configurations give them."""
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise TypeError(
@@ -232,7 +232,7 @@ def _renamed(
     argument: str, given: Mapping[NestedKey, NestedKey | None], names: Sequence[NestedKey]
 ) -> dict[NestedKey, NestedKey | None]:
     """Return the map from canonical names to the user's keys; refuse unknown names."""
-    listed = (_as_keys(argument, list(part)) for part in (given, given.values()))
+    listed = (as_keys(argument, list(part)) for part in (given, given.values()))
     pairs = dict(zip(*listed, strict=True))
     unknown = [name for name in pairs if name not in names]
     if unknown:

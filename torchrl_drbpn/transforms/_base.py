@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
-from torchrl_drbpn.functional.gaussian import zero_missing
+from torchrl_drbpn.functional.gaussian import check_observed, zero_missing
 
 Keys: TypeAlias = NestedKey | Sequence[NestedKey]
 
@@ -105,16 +105,6 @@ def read_vector(source: Any, key: NestedKey, owner: Transform) -> Any:
             "or cast it first, as with FlattenObservation, CatTensors or DTypeCastTransform."
         )
     return leaf
-
-
-def check_mask(mask: Tensor | TensorSpec, observation: Tensor | TensorSpec, key: NestedKey) -> None:
-    """Refuse a mask that is not bool with one entry for every component of its observation."""
-    if mask.dtype != torch.bool or mask.shape != observation.shape:
-        raise ValueError(
-            f"`{key}` must be bool of shape (*batch, obs) = {tuple(observation.shape)}, one entry "
-            f"per component, got {mask.dtype} {tuple(mask.shape)}. Is it the mask of another "
-            "observation? Pass mask_keys=... ."
-        )
 
 
 def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transform) -> None:
@@ -257,7 +247,7 @@ class CorruptingTransform(Transform, ABC):
             leaves = [read_vector(source, key, self) for key, _, _ in vector]
             for (_, mask_key, _), leaf in zip(vector, leaves, strict=True):
                 if mask_key in source.keys(True, True):
-                    check_mask(source[mask_key], leaf, mask_key)
+                    check_observed(leaf, source[mask_key], mask_key)
             if any(leaf.shape[:-1] != leaves[0].shape[:-1] for leaf in leaves):
                 raise ValueError(
                     f"`in_keys` {self.in_keys} must share their batch to count as one vector, got "

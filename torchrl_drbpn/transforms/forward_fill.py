@@ -6,11 +6,11 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 
+from torchrl_drbpn.functional.gaussian import check_observed
 from torchrl_drbpn.transforms._base import (
     EnvironmentTransform,
     Keys,
     as_key_list,
-    check_mask,
     flagged_rows,
     pair_keys,
     read_vector,
@@ -74,7 +74,7 @@ class FillLastObserved(EnvironmentTransform):
                     "not write. Put ObservationMissingness, SensorReduction or ObservedFromNaN "
                     "before it, or pass mask_keys=... ."
                 )
-            check_mask(source[mask_key], leaf, mask_key)
+            check_observed(leaf, source[mask_key], mask_key)
 
     def _fill(self, last: TensorDictBase | None, tensordict: TensorDictBase) -> TensorDictBase:
         if not self._checked:
