@@ -212,6 +212,8 @@ def test_bad_input_is_named_and_no_step_is_no_error():
         smooth_sequence(model, *inputs(data)[:4], data.observed.float(), data.reset)
     with pytest.raises(ValueError, match="`mean` and `cov` must have shapes"):
         smooth_sequence(model, data.start_mean, torch.eye(3), *inputs(data)[2:])
+    with pytest.raises(ValueError, match=r"`emission_cov` must be .* got \(4, 4\)"):
+        smooth_sequence(model, *inputs(data), emission_cov=torch.eye(4).double())
     with pytest.raises(ValueError, match="`action` must have shape"):
         forecast(model, data.start_mean, None, data.previous_action[..., :1])
     empty = smooth_sequence(model, *inputs(data, steps=slice(0)))

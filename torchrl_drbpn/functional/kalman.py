@@ -200,9 +200,9 @@ def sequential_update(
         s_i = h_i' P h_i + r_i, \quad k_i = P h_i / s_i, \quad
         m \leftarrow m + k_i (x_i - h_i' m), \quad P \leftarrow P - k_i h_i' P
 
-    Arguments and result are those of :func:`update`, R by its diagonal ``(obs,)`` alone [Anderson
-    and Moore 1979]; a ValueError for a matrix. Nothing is factorised: what has no Cholesky
-    decomposition, such as ONNX, can run it.
+    Arguments and result are those of :func:`update` but for rounding, R by its diagonal ``(obs,)``
+    alone [Anderson and Moore 1979]; a ValueError for a matrix. Nothing is factorised: what has no
+    Cholesky decomposition, such as ONNX, can run it.
 
     Example:
         >>> belief, H = Belief(torch.zeros(2), torch.eye(2)), torch.tensor([[1.0, 0.0], [1.0, 1.0]])

@@ -70,9 +70,14 @@ def smooth_sequence(
     inputs = FilterInputs(observation, observed, previous_action, reset, None, None, mean)
     model.check_inputs(inputs, reset.shape[:-1])
     H, offset, dtype = model.emission_matrix, model.offset(previous_action), mean.dtype
+    each = (*reset.shape, model.obs_dim, model.obs_dim)
     if emission_cov is None:
-        obs = model.obs_dim
-        emission_cov = model.full_emission_cov().expand(*reset.shape, obs, obs)
+        emission_cov = model.full_emission_cov().expand(each)
+    if emission_cov.shape != each:
+        raise ValueError(
+            "`emission_cov` must be R of every step, (*batch, time, obs, obs) = "
+            f"{each}, got {tuple(emission_cov.shape)}."
+        )
     with without_autocast(mean):
         filtered, predictions = [], []
         for t in range(reset.shape[-1]):
@@ -111,7 +116,7 @@ def forecast(
         x_j \sim N(H m_j + B a_j + d,\; H P_j H' + R)
 
     §4.1 [Särkkä 2013], extended by the Jacobian (§5.2) where f is not linear. A ValueError for a
-    wrong shape or dtype.
+    wrong shape.
 
     Args:
         model: the state-space model.
