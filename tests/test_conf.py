@@ -44,9 +44,10 @@ def test_what_is_composed_is_built(words):
     assert data["normalized_observation"].isfinite().all()
 
 
-def test_a_task_says_how_wide_actions_start_and_the_command_line_wins():
+def test_a_task_says_what_it_needs_and_the_command_line_wins():
     words = (["env=hopper"], ["env=ant"], ["env=halfcheetah"], ["env=ant", "heads.log_std=-1"])
     assert [make_config(*w).heads.log_std for w in words] == [0.0, -0.5, -0.5, -1]
+    assert make_config("env=swimmer", "method=gru").advantage.gamma == 0.9999
 
 
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)
