@@ -7,8 +7,6 @@ and the recipe's policy. Random actions are drawn ahead of the clock. A time of 
 is "collecting costs nothing".
 """
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 from itertools import cycle
@@ -22,6 +20,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, StepCounter, TransformedEnv
+from training.envs import COLLECTING
 
 from torchrl_drbpn import EnvPoolBatchEnv, GymnasiumBatchEnv
 
@@ -70,9 +69,7 @@ def collected(env: EnvBase, steps: int) -> Callable[[], object]:
         DrawnAhead(env, steps),
         frames_per_batch=env.batch_size[0] * steps,
         total_frames=-1,
-        track_traj_ids=False,
-        use_buffers=True,
-        auto_register_policy_transforms=False,
+        **COLLECTING,
     )
     return collector.rollout
 

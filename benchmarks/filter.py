@@ -12,8 +12,6 @@ Three questions over [batch, time], 30 % of the entries missing, 2 % of the step
 Ratios are times over GRUModule's; under 1 the filter is the faster one.
 """
 
-from __future__ import annotations
-
 import itertools
 import multiprocessing
 import resource

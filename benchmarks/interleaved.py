@@ -4,8 +4,6 @@ A round times every candidate once, in an order that rotates. A table shows the 
 rounds, half the distance between the quartiles, and the median of the ratio within a round.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.metadata
 import json

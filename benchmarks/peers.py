@@ -15,8 +15,6 @@ Decisions: the policies of the beliefs from what one robot, and what all of a ba
 that are not installed are left out: pip install -e '.[peers]'.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import warnings
 from collections.abc import Callable

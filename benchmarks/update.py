@@ -9,8 +9,6 @@ on plain tensors (PolicyStep), exported by torch.export, and compiled ahead of t
 (needs a C++ compiler; left out by --quick). All give the same action.
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
 import warnings

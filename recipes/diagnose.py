@@ -19,11 +19,10 @@ from analysis.calibration_tables import calibration_rows, precision_rows, reliab
 from evaluation.conditions import parse_conditions, removed_sensors
 from evaluation.folders import find_folders, output_folder, with_checkpoint
 from evaluation.trained import load_trained_agent
-from rendering.style import save_figure
+from rendering.style import write_or_remove
 from training.config import check_limits, check_mode, command
 from training.console import log_line
 from training.errors import UserError
-from training.run_folder import write_table
 
 from torchrl_drbpn import BeliefDivergedError
 
@@ -39,11 +38,9 @@ def run(config: dict[str, Any]) -> int:
     """Diagnose and write tables and figures, or draw these anew; see conf/diagnose.yaml."""
     if config["redraw"] is not None:
         return _draw(Path(config["redraw"]))
-    check_mode(config["mode"])
+    check_mode("mode", config["mode"])
     class_names(config["bins"])
     check_limits(config, {"episodes": (1, inf), "resamples": (2, inf)}, whole=True)
-    if not config["points"]:
-        raise UserError("`points` must hold at least one, such as trained or mcar:0.5.")
     folders = find_folders(config["run"])
     out = output_folder(config["out"], folders)
     torch.set_num_threads(config["threads"])
@@ -65,10 +62,7 @@ def run(config: dict[str, Any]) -> int:
             tables["reliability"] += [common | row for row in reliability_rows(tally)]
     out.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
-        if rows:
-            write_table(out / f"{name}.csv", rows)
-        else:
-            (out / f"{name}.csv").unlink(missing_ok=True)  # of an earlier diagnosis
+        write_or_remove(out / f"{name}.csv", rows or None)
     return _draw(out)
 
 
@@ -79,10 +73,7 @@ def _draw(folder: Path) -> int:
     for table, (name, draw) in FIGURES.items():
         path = folder / f"{table}.csv"
         figure = draw(pd.read_csv(path)) if path.is_file() else None
-        if figure is None:
-            (folder / name).unlink(missing_ok=True)
-        else:
-            save_figure(figure, folder / name, dpi=100)
+        write_or_remove(folder / name, figure, dpi=100)
     log_line(f"written: {folder}")
     return 0
 
@@ -100,8 +91,7 @@ def _diagnoses(
                 f"{folder.name}: belief={columns['belief']} keeps no estimate of its sensors; the "
                 "rows are those of the last value and the running mean"
             )
-        spike_std = float(config["spike_std"])
-        for condition in parse_conditions(config["points"], trained.settings, spike_std=spike_std):
+        for condition in parse_conditions(config["points"], trained.settings):
             drawn = {name: config[name] for name in ("episodes", "reduction_seed")}
             removed = removed_sensors(condition, trained, **drawn)
             try:

@@ -25,7 +25,7 @@ from rendering.style import save_figure
 from training.config import check_limits, check_mode, command
 from training.console import log_line
 from training.errors import UserError
-from training.sensors import have_names
+from training.sensors import named_sensors
 
 
 def run(config: dict[str, Any]) -> int:
@@ -63,11 +63,11 @@ def run(config: dict[str, Any]) -> int:
 
 
 def _protocol(config: dict[str, Any]) -> Protocol:
-    check_limits(config, dict.fromkeys(("episodes", "threads", "processes"), (1, inf)), whole=True)
+    check_limits(config, dict.fromkeys(("episodes", "processes"), (1, inf)), whole=True)
     if not config["modes"]:
         raise UserError("`modes` must hold sampled, mean or both, got none.")
     for mode in config["modes"]:
-        check_mode(mode)
+        check_mode("modes", mode)
     names = ("episodes", "seed", "reduction_seed", "threads", "robust", "robust_threshold")
     return Protocol(**{name: config[name] for name in names})
 
@@ -92,22 +92,20 @@ def _output(config: dict[str, Any], folders: Sequence[Path]) -> Path:
 
 def _conditions(config: dict[str, Any], folder: Path, trained: TrainedAgent) -> list[Condition]:
     """Return what a run is evaluated under."""
-    texts = config["points"]
-    if texts is None:
-        model, levels = True, dict(config["grid"])
-        try:
-            kept_sensors(trained, 0)
-        except UserError as error:
-            model = False
-            log_line(f"{folder.name}: sensors are removed at random only; {error}")
-        if config["full"] and not have_names(trained.sensors):
-            levels["outage_groups"] = ["sensor"]
-            log_line(
-                f"{folder.name}: outages of single sensors only, these have no names to group by"
-            )
-        texts = default_conditions(levels, full=config["full"], model=model)
-    listed = [texts] if isinstance(texts, str) else texts
-    return parse_conditions(listed, trained.settings, spike_std=float(config["spike_std"]))
+    settings = trained.settings
+    if config["points"] is not None:
+        return parse_conditions(config["points"], settings)
+    model, levels = True, dict(config["grid"])
+    try:
+        kept_sensors(trained, 0)
+    except UserError as error:
+        model = False
+        log_line(f"{folder.name}: sensors are removed at random only; {error}")
+    if config["full"] and not named_sensors(settings.env.id, settings.env.version):
+        levels["outage_groups"] = ["sensor"]
+        log_line(f"{folder.name}: outages of single sensors only, these have no names to group by")
+    texts = default_conditions(levels, full=config["full"], model=model)
+    return parse_conditions(texts, settings)
 
 
 def _summary(rows: pd.DataFrame) -> str:

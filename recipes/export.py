@@ -40,7 +40,7 @@ INPUTS = ("observation", "observed", "previous_action", "is_init", "mean", "age"
 OUTPUTS = ("action", "next_mean", "next_age", "chosen", "rejected", "next_cov")
 FORMATS = {"aoti": ".pt2", "export": ".pt2", "onnx": ".onnx"}
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-_LIMITS = {"robots": (1, inf), "steps": (1, inf), "calls": (1, inf), "threads": (1, 256)}
+_LIMITS = dict.fromkeys(("robots", "steps", "calls"), (1, inf))
 # Together they compile the matrix products too, which are calls into ATen without them.
 _INDUCTOR = {"freezing": True, "max_autotune": True}
 _TOLERANCE = 1e-3  # of the largest action

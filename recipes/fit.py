@@ -29,7 +29,7 @@ from training.run_folder import write_table
 from torchrl_drbpn import BeliefFilter, MaskedObservationNorm
 
 _FILTER, _LINEAR = "filter", "linear Kalman filter"
-_WHOLE = dict.fromkeys(("steps", "sequence_length", "batch_size", "patience", "threads"), (1, inf))
+_WHOLE = dict.fromkeys(("steps", "sequence_length", "batch_size", "patience"), (1, inf))
 _LIMITS = {
     **dict.fromkeys(("hold_out", "hide"), (0.01, 0.99)),
     **dict.fromkeys(("lr", "max_grad_norm"), (1e-9, inf)),
@@ -41,7 +41,7 @@ _SHOWN_STEPS, _SHOWN_SENSORS = 200, 4
 
 def run(config: dict[str, Any]) -> int:
     """Fit, compare and write; see conf/fit.yaml."""
-    check_limits(config, _WHOLE | {"seed": (0, inf)}, whole=True)
+    check_limits(config, _WHOLE, whole=True)
     check_limits(config, _LIMITS)
     if config["belief"].get("pretrained"):
         raise UserError("`belief.pretrained` is what this command makes; leave it out.")

@@ -29,7 +29,6 @@ _LIMITS = {
     "frames": (0, inf),
     "size": (240, 1920),
     "colours": (8, 256),
-    "fps": (1, 50),  # a GIF counts in hundredths of a second
 }
 _STRIP = (248, 330)  # pixels of a picture of the robot above the panels of a figure
 
@@ -39,8 +38,8 @@ def run(config: dict[str, Any]) -> int:
     out, first = _check(config), config["start"]
     torch.set_num_threads(config["threads"])
     trained = load_trained_agent(Path(config["run"]))
-    text, spike_std = str(config["point"]), float(config["spike_std"])
-    condition = parse_condition(text, trained.settings, spike_std=spike_std)
+    text = str(config["point"])
+    condition = parse_condition(text, trained.settings)
     still = out.suffix == ".png"
     # Panels of the first frame of a video look back too.
     begin = first if still else max(0, first - config["window"] + 1)
@@ -90,8 +89,9 @@ def _check(config: dict[str, Any]) -> Path:
     """Refuse what can't be shown, before an agent is loaded; return where it goes."""
     if config["run"] is None or not Path(config["run"]).is_dir():
         raise UserError(f"`run` must name a run folder: run=runs/<folder>, got {config['run']}.")
-    check_limits(config, _LIMITS)
-    check_mode(config["mode"])
+    check_limits(config, _LIMITS, whole=True)
+    check_limits(config, {"fps": (1, 50)})  # a GIF counts in hundredths of a second
+    check_mode("mode", config["mode"])
     out = Path(config["out"] or Path(config["run"]) / "play.gif")
     if not out.parent.is_dir():
         raise UserError(f"`out` must lie in an existing folder, got {out}.")

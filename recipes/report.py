@@ -10,17 +10,16 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from analysis.figures import learning_curves, robustness
 from analysis.page import page
 from analysis.runs import Study, read_runs
 from analysis.tables import derived_tables
 from evaluation.folders import find_folders
-from rendering.style import save_figure
+from rendering.style import write_or_remove
 from training.config import check_limits, command
 from training.console import log_line
 from training.errors import UserError
-from training.run_folder import write_table, write_whole
+from training.run_folder import write_whole
 
 NOTES_FILE = "notes.md"
 
@@ -65,9 +64,9 @@ def _write_page(folder: Path, config: dict[str, Any]) -> None:
         shown = tables["summary"][tables["summary"]["mode"] == mode]
         figures[name] = robustness(shown, rows="kind", columns="task")
     for name, table in tables.items():
-        _replace(folder / f"{name}.csv", table if len(table) else None)
+        write_or_remove(folder / f"{name}.csv", table if len(table) else None)
     for name, figure in figures.items():
-        _replace(folder / name, figure)
+        write_or_remove(folder / name, figure, dpi=80, palette=True)
     drawn = [name for name, figure in figures.items() if figure is not None]
     notes, path = folder / NOTES_FILE, folder / "README.md"
     text = notes.read_text(encoding="utf-8") if notes.is_file() else ""
@@ -75,16 +74,6 @@ def _write_page(folder: Path, config: dict[str, Any]) -> None:
     title = config["title"] or heading
     write_whole(path, page(study, tables, drawn, title=title, notes=text, folder=folder.name))
     log_line(f"{len(study.runs)} runs, written: {folder}")
-
-
-def _replace(path: Path, content: Any) -> None:
-    """Write a table or a figure; one of an earlier report that is not true any more is removed."""
-    if content is None:
-        path.unlink(missing_ok=True)
-    elif isinstance(content, pd.DataFrame):
-        write_table(path, content)
-    else:
-        save_figure(content, path, dpi=80, palette=True)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ def configured(command="evaluate", *overrides):
 
 
 def parse(text, settings):
-    return parse_condition(text, settings, spike_std=5.0)
+    return parse_condition(text, settings)
 
 
 def evaluate(table, *runs, points="", **options):

@@ -99,7 +99,7 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path):
         ("noise.sigma=-1", "`noise.sigma` must be at least 0, got -1"),
         ("optim.sequence_length=48", "`optim.sequence_length` must divide"),
         ("optim.minibatches=7", "`optim.minibatches` must divide the 8 sequences"),
-        ("evaluation.modes=[best]", "`modes` must hold sampled and mean, got 'best'"),
+        ("evaluation.modes=[best]", "`evaluation.modes` must be sampled or mean, got 'best'"),
         ("missingness.always_observed=1.0", "`missingness.always_observed` must be under 1"),
         ("env=gym", "`env.id` must be given"),
         ("env.name=CartPole-v1", "`env.name` is no setting: did you mean"),
@@ -199,18 +199,17 @@ COMMANDS = ("evaluate", "diagnose", "export", "play", "plot_sensors", "report", 
         ("evaluate", {"run": None}, NO_RUN),
         ("evaluate", {"episodes": 0}, "`episodes` must be at least 1, got 0"),
         ("evaluate", {"processes": 1.5}, "`processes` must be at least 1, got 1.5"),
-        ("evaluate", {"modes": ["best"]}, "`modes` must hold sampled and mean"),
+        ("evaluate", {"modes": ["best"]}, "`modes` must be sampled or mean"),
         ("evaluate", {"modes": []}, "`modes` must hold sampled, mean or both"),
         ("evaluate", {"output": "no/such/folder/x.csv"}, "`output` must lie in an existing folder"),
-        ("evaluate", {"points": ["reduction:0.5:random"], "reduction_seed": -1},
-         "`reduction_seed` must be"),
+        ("evaluate", {"points": []}, "`points` must hold at least one"),
         ("evaluate", {"robust": "gate"}, "`robust` must be one of huber, imq, or None"),
         ("evaluate", {"robust": "imq", "robust_threshold": 0},
          "`robust_threshold` must be a positive, finite"),
         ("diagnose", {"run": None}, NO_RUN),
         ("diagnose", {"redraw": "nowhere"}, "nowhere has no tables"),
         ("diagnose", {"points": []}, "`points` must hold at least one"),
-        ("diagnose", {"mode": "best"}, "`modes` must hold"),
+        ("diagnose", {"mode": "best"}, "`mode` must be sampled or mean"),
         ("diagnose", {"episodes": 0}, "`episodes` must be at least 1, got 0"),
         ("diagnose", {"bins": [1, 3, 3]}, "`bins` must be whole numbers that start at 1 and asc"),
         ("diagnose", {"resamples": 1}, "`resamples` must be at least 2"),
@@ -224,8 +223,9 @@ COMMANDS = ("evaluate", "diagnose", "export", "play", "plot_sensors", "report", 
         ("export", {"robots": 0}, "`robots` must be at least 1, got 0"),
         ("play", {"run": None}, NO_RUN),
         ("play", {"point": "mcar:2"}, "`points` must hold"),
-        ("play", {"mode": "best"}, "`modes` must hold"),
+        ("play", {"mode": "best"}, "`mode` must be sampled or mean"),
         ("play", {"steps": 0}, "`steps` must be at least 1, got 0"),
+        ("play", {"every": 1.5}, "`every` must be at least 1, got 1.5"),
         ("play", {"start": -1}, "`start` must be at least 0, got -1"),
         ("play", {"start": 100_000}, "`start` must lie inside the episode"),
         ("play", {"fps": 60}, r"`fps` must be in \[1, 50\], got 60"),
@@ -284,3 +284,21 @@ def test_the_line_goes_to_standard_error_with_status_2(name, tmp_path, monkeypat
         (line,) = capsys.readouterr().err.splitlines()
         assert left.value.code == 2
         assert line.startswith(("error: `run", "error: `nowhere"))
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("seed=-1", "`seed` must be in [0, "),
+        ("reduction_seed=-1", "`reduction_seed` must be at least 0, got -1"),
+        ("threads=0", "`threads` must be in [1, 256], got 0"),
+    ],
+)
+def test_what_several_commands_have_is_checked_before_any_of_them_runs(
+    word, line, monkeypatch, capsys
+):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(sys, "argv", ["diagnose.py", word])
+    with pytest.raises(SystemExit):
+        run_command("diagnose", pytest.fail)
+    assert capsys.readouterr().err.startswith(f"error: {line}")

@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from rendering.style import STYLE, colours, legend_below, panel_grid
-from scipy.stats import bootstrap
 
 from analysis.runs import GROUP, THRESHOLDS
 from analysis.statistics import interquartile_mean, interval
@@ -125,13 +124,8 @@ def episode_summary(episodes: pd.DataFrame) -> pd.DataFrame:
     for key, rows in episodes.groupby([*GROUP, "point", "mode"], sort=False):
         runs = rows.groupby("run")["return"].mean()
         values = (runs if len(runs) > 1 else rows["return"]).to_numpy(float)
-        ends = (np.nan, np.nan)
-        if len(values) > 1:
-            rng = np.random.default_rng(0)
-            drawn = bootstrap((values,), np.mean, n_resamples=2000, method="percentile", rng=rng)
-            ends = drawn.confidence_interval
         missing = np.average(rows.missing_ratio, weights=rows.length)
-        out.append([*key, values.mean(), *ends, missing])
+        out.append([*key, values.mean(), *interval(values, statistic=np.mean), missing])
     columns = [*GROUP, "point", "mode", "return", "low", "high", "missing_ratio"]
     return pd.DataFrame(out, columns=columns)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_drbpn import BeliefFilter
-from torchrl_drbpn.functional import Belief, FilterOutput, outage_rates, sample_working
+from torchrl_drbpn.functional import Belief, outage_rates, sample_working
 
 INTERVALS = {"coverage_50": 0.6744897501960817, "coverage_90": 1.6448536269514722}
 
@@ -53,20 +53,21 @@ def split(episodes: int, share: float, seed: int) -> tuple[Tensor, Tensor, Tenso
     return (rest[held:], rest[:held], test) if len(rest) > held else (rest, rest, test)
 
 
-def run(belief_filter: BeliefFilter, data: Sequences, before: Belief | None = None) -> FilterOutput:
-    """Filter sequences, from their own first step or from beliefs before it."""
-    return belief_filter(*(before or _zero_belief(belief_filter, data)), *data, return_cov=True)
+def run(
+    belief_filter: BeliefFilter, data: Sequences, before: Belief | None = None
+) -> tuple[Belief, Tensor]:
+    """Filter sequences, from their own first step or from beliefs before it.
+
+    Returns the belief after each step, and the log-likelihood per observed entry, nats.
+    """
+    out = belief_filter(*(before or _zero_belief(belief_filter, data)), *data, return_cov=True)
+    return Belief(out.mean, out.cov), out.log_likelihood.sum() / data.observed.sum().clamp_min(1)
 
 
 def _zero_belief(belief_filter: BeliefFilter, data: Sequences) -> Belief:
     """Return the beliefs before a first step, where they are of no account."""
     zero = data.observation.new_zeros(len(data.reset), belief_filter.state_dim)
     return Belief(zero, torch.diag_embed(zero))
-
-
-def per_entry(out: FilterOutput, data: Sequences) -> Tensor:
-    """Return the log-likelihood per observed entry, nats."""
-    return out.log_likelihood.sum() / data.observed.sum().clamp_min(1)
 
 
 def fit(
@@ -111,15 +112,15 @@ def fit(
         order = useful[torch.randperm(len(useful), generator=generator)]
         for index in torch.split(order, batch_size)[: steps - done]:
             batch = windows.rows(index)
-            loss = -per_entry(run(belief_filter, batch, Belief(*(x[index] for x in starts))), batch)
+            _, likelihood = run(belief_filter, batch, Belief(*(x[index] for x in starts)))
             optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            (-likelihood).backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(belief_filter.parameters(), max_grad_norm)
             optimizer.step()
             schedule.step()
             done += 1
         with torch.no_grad():
-            found = per_entry(run(belief_filter, validation), validation).item()
+            found = run(belief_filter, validation)[1].item()
         waited += 1
         if found > best:
             best, kept, waited = found, copy.deepcopy(belief_filter.state_dict()), 0
@@ -136,15 +137,14 @@ def fit(
 @torch.no_grad()
 def _starts(belief_filter: BeliefFilter, data: Sequences, length: int) -> Belief:
     """Return the belief before each window; refresh the Jacobian of a propagated covariance."""
-    out = run(belief_filter, data)
+    beliefs, _ = run(belief_filter, data)
     if belief_filter.covariance == "propagated":
         goes_on = ~data.reset[:, 1:]
         action = data.previous_action[:, 1:][goes_on]
-        belief_filter.refresh_jacobian(out.mean[:, :-1][goes_on], action)
+        belief_filter.refresh_jacobian(beliefs.mean[:, :-1][goes_on], action)
     mean, cov = (
         torch.cat([torch.zeros_like(x[:, :1]), x[:, length - 1 : -1 : length]], 1).flatten(0, 1)
-        for x in out[:2]
-        if x is not None
+        for x in beliefs
     )
     return Belief(mean, cov)
 
@@ -165,10 +165,8 @@ def estimates(filters: dict[str, BeliefFilter], data: Sequences) -> dict[str, Es
     """Estimate every reading from those before it, and by the smoother from all."""
     found = {}
     for name, belief_filter in filters.items():
-        out = run(belief_filter, data)
-        filtered = Belief(out.mean, out.cov if out.cov is not None else out.mean)
-        likelihood = per_entry(out, data).item()
-        found[name] = _readings(belief_filter, filtered, data, likelihood)
+        filtered, likelihood = run(belief_filter, data)
+        found[name] = _readings(belief_filter, filtered, data, likelihood.item())
     first, belief_filter = next(iter(filters.items()))
     smoothed = belief_filter.smooth(*_zero_belief(belief_filter, data), *data)
     found[f"{first}, smoothed"] = _readings(belief_filter, smoothed, data, None)

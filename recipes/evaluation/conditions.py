@@ -58,7 +58,7 @@ class Condition:
         }
 
 
-def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Condition:
+def parse_condition(text: str, settings: DictConfig) -> Condition:
     """Read a condition such as ``mcar:0.5``, see conf/evaluate.yaml.
 
     What the text does not name stays as in ``settings``, the configuration of the run.
@@ -79,8 +79,6 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
             f"got {text!r}."
         )
     if family in ("noise", *FAULTS):
-        if family == "spikes" and values["spike_std"] is None:
-            values["spike_std"] = spike_std
         name = condition_name(family, values)
         task = {"id": "${env.id}", "version": "${env.version}"} if "group_by" in values else {}
         noise = OmegaConf.create({str(key): noise[key] for key in noise} | values | task)
@@ -103,11 +101,12 @@ def parse_condition(text: str, settings: DictConfig, *, spike_std: float) -> Con
     return Condition(name, family, missing, noise, **taken)
 
 
-def parse_conditions(
-    texts: Sequence[Any], settings: DictConfig, *, spike_std: float
-) -> list[Condition]:
-    """Read conditions; one that comes twice, under two names perhaps, is one."""
-    read = [parse_condition(str(text), settings, spike_std=spike_std) for text in texts]
+def parse_conditions(points: str | Sequence[Any], settings: DictConfig) -> list[Condition]:
+    """Read one condition or several; one that comes twice, under two names perhaps, is one."""
+    texts = [points] if isinstance(points, str) else points
+    if not texts:
+        raise UserError("`points` must hold at least one, such as trained or mcar:0.5.")
+    read = [parse_condition(str(text), settings) for text in texts]
     return list({condition.name: condition for condition in read}.values())
 
 
@@ -151,8 +150,6 @@ def removed_sensors(
     """
     if not condition.selection:
         return None
-    if not isinstance(reduction_seed, int) or reduction_seed < 0:
-        raise UserError(f"`reduction_seed` must be a whole number from 0, got {reduction_seed!r}.")
     count = round(condition.ratio * trained.obs_dim)
     removed = torch.zeros(episodes, trained.obs_dim, dtype=torch.bool)
     if condition.selection == "model":

@@ -33,7 +33,7 @@ FIELDS: dict[str, tuple[tuple[Any, ...], ...]] = {
     "multi_rate": (("period", int), _GROUP_BY, ("phase", int, None)),
     "reduction": (("ratio", _SHARE), ("selection", _one_of("model", "random"))),
     "noise": (("sigma", _number()),),
-    "spikes": (("spike_probability", _SHARE), ("spike_std", _number(), None)),
+    "spikes": (("spike_probability", _SHARE), ("spike_std", _number(), 5.0)),
     "stuck": (("stuck_probability", _SHARE), ("stuck_mean_length", _number(), 20.0), _GROUP_BY),
     "drift": (("drift_std", _number()), ("drift_rate", _number(-math.inf), 0.0)),
 }

@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
-from training.run_folder import whole
+from training.run_folder import whole, write_table
 
 STYLE: Any = {
     "font.size": 9.5,
@@ -66,3 +66,13 @@ def save_figure(figure: Figure, path: Path, *, dpi: int, palette: bool = False) 
             with Image.open(temporary) as picture:
                 few = picture.convert("RGB").quantize(256, kmeans=1)
             few.save(temporary, format="png", optimize=True)
+
+
+def write_or_remove(path: Path, content: Any, **look: Any) -> None:
+    """Write a table, or a figure with its looks; None removes that of an earlier call."""
+    if content is None:
+        path.unlink(missing_ok=True)
+    elif isinstance(content, Figure):
+        save_figure(content, path, **look)
+    else:
+        write_table(path, content)

@@ -80,8 +80,6 @@ def checkpoint_frames(folder: Path) -> int | None:
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint, its sums checked first; a damaged one names the one before it."""
-    if not path.is_file():
-        raise UserError(f"`{path}` must be a checkpoint; there is no such file.")
     try:
         _check_sums(path)
         state: Any = torch.load(path, weights_only=True, map_location="cpu")

@@ -40,6 +40,8 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "optim.lr": (0, inf),
     **dict.fromkeys(("optim.max_grad_norm", "loss.clip_epsilon"), (1e-12, inf)),
 }
+# Whole numbers of the commands that have them.
+_COMMON = {"seed": (0, 2**63 - 1), "reduction_seed": (0, inf), "threads": (1, 256)}
 
 
 def composed_config(overrides: Sequence[str] = ()) -> DictConfig:
@@ -103,7 +105,7 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
             "Take missingness=none."
         )
     for mode in config.evaluation.modes:
-        check_mode(mode)
+        check_mode("evaluation.modes", mode)
     return config
 
 
@@ -170,10 +172,10 @@ def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
-def check_mode(mode: str) -> None:
+def check_mode(key: str, mode: str) -> None:
     """Refuse what is not the name of a kind of action, ``sampled`` or ``mean``."""
     if mode not in ("sampled", "mean"):
-        raise UserError(f"`modes` must hold sampled and mean, got {mode!r}.")
+        raise UserError(f"`{key}` must be sampled or mean, got {mode!r}.")
 
 
 def _run_folder(resume: str | None, env: str, version: str | None, belief: str, seed: int) -> str:
@@ -214,8 +216,14 @@ def command(name: str, run: Callable[[dict[str, Any]], int]) -> None:
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def main(config: DictConfig) -> None:
         plain = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+
+        def checked_run() -> int:
+            limits = {key: limit for key, limit in _COMMON.items() if key in plain}
+            check_limits(plain, limits, whole=True)
+            return run(plain)
+
         # Explained in here: Hydra puts a line of its own before an error that leaves its job.
-        if status := explained(lambda: run(plain), name):
+        if status := explained(checked_run, name):
             sys.exit(status)
 
     run_command(main, name)

@@ -66,7 +66,7 @@ def sensor_groups(names: Sequence[str], by: str) -> list[list[int]] | None:
         return None
     if by not in ("joint", "kind"):
         raise UserError(f"`group_by` must be sensor, joint or kind, got {by!r}.")
-    if not names or not have_names(names):
+    if not names:
         raise UserError(
             f"`group_by={by}` goes by the names of the sensors, which this task has none of: "
             "take group_by=sensor."
@@ -77,11 +77,6 @@ def sensor_groups(names: Sequence[str], by: str) -> list[list[int]] | None:
         group = _joint(name, hinges) if by == "joint" else _kind(name)
         groups.setdefault(group, []).append(index)
     return list(groups.values())
-
-
-def have_names(names: Sequence[str]) -> bool:
-    """Return whether sensors have names by which they can be grouped."""
-    return not any(name.startswith("component ") for name in names)
 
 
 def _joint(name: str, hinges: set[str]) -> str:
