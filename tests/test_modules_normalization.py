@@ -290,6 +290,7 @@ test_impossible_settings_are_refused = refuses(
     ({"eps": 0.0}, "`eps` must"),
     ({"missing": "drop"}, "`missing` must"),
     ({"in_keys": ["a", "b", "c"]}, "`in_keys` must name"),
+    ({"in_keys": ["a", None]}, "`in_keys` must name"),
     ({"out_keys": ["observation"]}, "`out_keys` must differ"),
     make=functools.partial(MaskedObservationNorm, obs_dim=OBS),
 )

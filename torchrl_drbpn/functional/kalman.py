@@ -137,7 +137,20 @@ def innovation(
         ([1.0, 0.0], [2.0, 2.0])
     """
     H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov, offset)
-    expected = (H @ belief.mean.double().unsqueeze(-1)).squeeze(-1)
+    return _innovation(belief.mean, observation, observed, H, P, R, offset)
+
+
+def _innovation(
+    mean: Tensor,
+    observation: Tensor,
+    observed: Tensor,
+    H: Tensor,
+    P: Tensor,
+    R: Tensor,
+    offset: Tensor | None,
+) -> Belief:
+    """Return v and S of what :func:`_covariances` has checked."""
+    expected = (H @ mean.double().unsqueeze(-1)).squeeze(-1)
     expected = expected if offset is None else expected + offset
     # Zero first, subtract after: a NaN under a False mask must reach neither value nor gradient.
     residual = zero_missing(zero_missing(observation, observed) - expected, observed)
@@ -171,9 +184,8 @@ def update(
         ([0.25, 0.0], True)
     """
     dtype = belief.mean.dtype
-    v, S = innovation(belief, observation, observed, emission_matrix, emission_cov, offset)
-    H, R = emission_matrix.double(), as_matrix("emission_cov", emission_cov, v.shape[-1]).double()
-    P = as_matrix("belief.cov", belief.cov, belief.mean.shape[-1]).double()
+    H, P, R = _covariances(belief, observation, observed, emission_matrix, emission_cov, offset)
+    v, S = _innovation(belief.mean, observation, observed, H, P, R, offset)
     factor = factorise("the innovation covariance H P H' + R", masked_cov(S, observed))
     # K' = A^-1 (M'M) H P: the rows of missing entries are zero, so K ignores them.
     cross = zero_missing(H @ P, observed.unsqueeze(-1))

@@ -35,7 +35,7 @@ def checked(
     else:
         if silent:
             return out
-        total = out.log_likelihood.detach().sum() + out[0].detach().sum()
+        total = out.log_likelihood.detach().sum() + out[0].detach().sum()  # the state is first
         try:
             if bool(total.isfinite()):
                 return out

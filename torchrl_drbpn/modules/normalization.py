@@ -92,7 +92,7 @@ class MaskedObservationNorm(TensorDictModuleBase):
             raise ValueError(f"`missing` must be 'zero' or 'keep', got {missing!r}.")
         inputs = as_keys("in_keys", in_keys)
         outputs = as_keys("out_keys", out_keys)
-        if len(inputs) not in (1, 2) or len(outputs) != 1:
+        if len(inputs) not in (1, 2) or len(outputs) != 1 or None in (*inputs, *outputs):
             raise ValueError(
                 "`in_keys` must name an observation and its mask, or an observation alone, and "
                 f"`out_keys` one entry, got {inputs} and {outputs}."
