@@ -213,6 +213,15 @@ def test_numbers_are_finite_not_negative_and_as_many_as_components(make, name, n
             use()
 
 
+def test_a_configuration_names_a_nested_action_by_a_list():
+    keys = {"in_keys": [["agents", "observation"]], "action_key": ["agents", "action"]}
+    flat, nested = MAR(seed=0), MAR(seed=0, **keys)
+    action = TensorDict({"action": torch.ones(4, ACTION)}, [4])
+    one = flat._step(action, data())
+    other = nested._step(TensorDict({"agents": action}, [4]), TensorDict({"agents": data()}, [4]))
+    assert torch.equal(other["agents", "observed"], one["observed"])
+
+
 def use_keys_of_different_batch():
     nested = TensorDict({"observation": torch.ones(2, 3, OBS)}, [2, 3])
     both = TensorDict({"agents": nested, "observation": torch.ones(2, OBS)}, [2])

@@ -100,7 +100,7 @@ class ObservationMissingness(SeededTransform):
         self.eta = eta
         self.always_observed = always_observed
         self.mechanism_seed = check_seed(mechanism_seed, "mechanism_seed")
-        (self.action_key,) = as_key_list(action_key)
+        (self.action_key,) = as_key_list([action_key])
         self.mechanism_parameters: MissingnessMechanism | None = None
 
     @property
