@@ -47,6 +47,19 @@ def test_what_can_not_be_trained_is_one_line(make, num_envs, keys, message):
         made(make, num_envs, keys)
 
 
+@pytest.mark.parametrize("spread", [True, False])
+def test_robots_that_never_fall_do_not_stay_in_step(spread):
+    sizes = ("collector.num_envs=16", "collector.steps_per_env=128", "env=reacher")
+    training, _ = assembled(*SMOKE, *sizes, f"collector.spread={str(spread).lower()}")
+    for _ in range(2):  # a run starts twice: what it throws away spreads nothing
+        done = training.collector.rollout()["next", "done"].squeeze(-1)
+        ends = [row.nonzero().squeeze(-1) for row in done]
+        firsts = torch.stack([row[0] + 1 for row in ends])
+        assert len(firsts.unique()) > 8 if spread else (firsts == 50).all()
+        assert all((row.diff() == 50).all() for row in ends)
+        training.start_episodes()
+
+
 class MaskingEnv(StaircaseEnv):
     """Component i arrives at the steps that i + 1 divides; elsewhere a number that is none."""
 

@@ -156,9 +156,10 @@ def test_a_checkpoint_of_another_shape_is_refused(smoke, overrides):
         ("belief=drbpn", "env=hopper", "missingness=mar"),
         ("missingness=outages", "missingness.group_by=joint", "noise=spikes"),
         ("belief=drbpn_propagated", "missingness=mcar"),
+        ("env=halfcheetah", "+env.kwargs.max_episode_steps=150"),
         pytest.param(("optim.compile=true",), marks=[compiles, pytest.mark.slow]),
     ],
-    ids=["hopper", "outages-spikes", "propagated", "compiled"],
+    ids=["hopper", "outages-spikes", "propagated", "first-episodes-cut", "compiled"],
 )
 def test_a_resumed_run_equals_one_that_never_stopped(overrides, tmp_path):
     straight = tmp_path / "straight"

@@ -18,7 +18,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Transform, TransformedEnv
 from torchrl.modules.utils import get_primers_from_module
 from training.config import one_line
-from training.envs import COLLECTING
+from training.envs import COLLECTING, spread_episodes
 from training.errors import EnvironmentFault, UserError
 
 _RECIPES = Path(__file__).parents[1]
@@ -45,6 +45,7 @@ class RayRollouts:
         workers: int,
         cpus_per_worker: int,
         address: str | None,
+        spread: bool = False,  # of runs that do not say
     ) -> None:
         if num_envs % workers:
             raise UserError(
@@ -55,6 +56,7 @@ class RayRollouts:
             raise UserError("`collector=ray` needs device=cpu: its workers run the policy there.")
         self._ray = _connect(address, workers * cpus_per_worker)
         self._policy, self._make_env, self._cpus = policy, make_env, cpus_per_worker
+        self._spread = spread
         self._num_envs, self._steps, self._workers = num_envs, steps_per_env, workers
         self._counts = hasattr(env.base_env, "engine_resets")
         self.engine_resets = torch.zeros(1)
@@ -106,7 +108,10 @@ class RayRollouts:
         resources = {"num_cpus": self._cpus, "scheduling_strategy": "SPREAD"}
         resources["runtime_env"] = {"env_vars": variables}
         self._collector = Collector(
-            [partial(_worker_env, self._make_env, size, int(seed), primers) for seed in seeds],
+            [
+                partial(_worker_env, self._make_env, size, int(seed), primers, self._spread)
+                for seed in seeds
+            ],
             self._policy,
             backend="ray",
             sync=True,
@@ -118,13 +123,19 @@ class RayRollouts:
 
 
 def _worker_env(
-    make_env: Callable[..., TransformedEnv], num_envs: int, seed: int, primers: Transform | None
+    make_env: Callable[..., TransformedEnv],
+    num_envs: int,
+    seed: int,
+    primers: Transform | None,
+    spread: bool,
 ) -> TransformedEnv:
     """Build the environment of a worker, in it; actions are drawn from torch's generator there."""
     torch.manual_seed(seed)
     env = make_env(num_envs=num_envs, seed=seed)
     if primers is not None:
         env.append_transform(primers)
+    if spread:
+        spread_episodes(env)
     return env
 
 

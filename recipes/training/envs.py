@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -17,6 +18,7 @@ from torchrl.envs import (
     DoubleToFloat,
     EnvBase,
     ParallelEnv,
+    RandomTruncationTransform,
     RenameTransform,
     SerialEnv,
     Transform,
@@ -233,6 +235,41 @@ def _groups(id: str, version: str | None, by: str) -> list[list[int]] | None:
     return sensor_groups(named_sensors(id, version), by)
 
 
+class SpreadEpisodes(RandomTruncationTransform):
+    """Cut the first episode of every simulator at a random step, no other one.
+
+    Simulators of a robot that never falls would begin all their episodes in one rollout of many:
+    each update would see one phase of the episode, and beginnings would be forgotten in between
+    (staggered resets, [Bharthulwar et al. 2025]).
+    """
+
+    def __init__(self, horizon: int) -> None:
+        super().__init__(1, horizon)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        if tensordict.get("_reset", None) is None:  # all begin anew: a run starts, or starts again
+            self._initialized = False
+        return super()._reset(tensordict, tensordict_reset)
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return the steps at which episodes are cut: a resumed run goes on with them."""
+        return {} if self._horizons is None else {"horizons": self._horizons.clone()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Take up what :meth:`get_extra_state` returned."""
+        if "horizons" in state:
+            self._horizons, self._initialized = state["horizons"].clone(), True
+            self._first_episode = torch.ones_like(self._horizons, dtype=torch.bool)
+
+
+def spread_episodes(env: TransformedEnv) -> None:
+    """Let the episodes of a batch end at different steps, where they have a longest one."""
+    if horizon := getattr(env, "max_episode_steps", None):
+        env.append_transform(SpreadEpisodes(horizon))
+
+
 def make_collector(
     env: TransformedEnv,
     policy: TensorDictModuleBase,
@@ -240,8 +277,11 @@ def make_collector(
     *,
     num_envs: int,
     steps_per_env: int,
+    spread: bool = False,  # of runs that do not say
 ) -> Collector:
     """Make TorchRL's collector of one rollout after the other, kept where the policy is."""
+    if spread:
+        spread_episodes(env)
     frames, device = num_envs * steps_per_env, next(policy.parameters()).device
     places: dict[str, Any] = {}
     if device.type != "cpu":
