@@ -47,7 +47,9 @@ def test_what_is_composed_is_built(words):
 def test_a_task_says_what_it_needs_and_the_command_line_wins():
     words = (["env=hopper"], ["env=ant"], ["env=halfcheetah"], ["env=ant", "heads.log_std=-1"])
     assert [make_config(*w).heads.log_std for w in words] == [0.0, -0.5, -0.5, -1]
-    assert make_config("env=swimmer", "method=gru").advantage.gamma == 0.9999
+    swimmer = make_config("env=swimmer", "method=gru")
+    assert (swimmer.advantage.gamma, swimmer.collector.steps_per_env) == (0.9999, 128)
+    assert make_config("env=swimmer", "collector=batched").collector.num_envs == 64
 
 
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)
