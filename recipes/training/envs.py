@@ -265,9 +265,13 @@ class SpreadEpisodes(RandomTruncationTransform):
 
 
 def spread_episodes(env: TransformedEnv) -> None:
-    """Let the episodes of a batch end at different steps, where they have a longest one."""
-    if horizon := getattr(env, "max_episode_steps", None):
-        env.append_transform(SpreadEpisodes(horizon))
+    """Let the episodes of a batch of Gymnasium's simulators end at different steps.
+
+    TorchRL's other environments do not tell how long an episode may be.
+    """
+    simulators = env.base_env
+    if isinstance(simulators, GymnasiumBatchEnv | EnvPoolBatchEnv) and simulators.max_episode_steps:
+        env.append_transform(SpreadEpisodes(simulators.max_episode_steps))
 
 
 def make_collector(
