@@ -55,8 +55,9 @@ class RayRollouts:
         if next(policy.parameters()).device.type != "cpu":
             raise UserError("`collector=ray` needs device=cpu: its workers run the policy there.")
         self._ray = _connect(address, workers * cpus_per_worker)
-        self._policy, self._make_env, self._cpus = policy, make_env, cpus_per_worker
-        self._spread = spread
+        primers = get_primers_from_module(policy, warn=False)
+        self._make_env = partial(_worker_env, make_env, num_envs // workers, primers, spread)
+        self._policy, self._cpus = policy, cpus_per_worker
         self._num_envs, self._steps, self._workers = num_envs, steps_per_env, workers
         self._counts = hasattr(env.base_env, "engine_resets")
         self.engine_resets = torch.zeros(1)
@@ -101,17 +102,13 @@ class RayRollouts:
             self._collector.get_distant_attr("worker_idx")
 
     def _start(self) -> None:
-        primers = get_primers_from_module(self._policy, warn=False)
-        size, seeds = self._num_envs // self._workers, torch.randint(2**62, (self._workers,))
+        seeds = torch.randint(2**62, (self._workers,))
         path = [str(_RECIPES), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
         variables = {"PYTHONPATH": os.pathsep.join(os.path.abspath(part) for part in path if part)}
         resources = {"num_cpus": self._cpus, "scheduling_strategy": "SPREAD"}
         resources["runtime_env"] = {"env_vars": variables}
         self._collector = Collector(
-            [
-                partial(_worker_env, self._make_env, size, int(seed), primers, self._spread)
-                for seed in seeds
-            ],
+            [partial(self._make_env, int(seed)) for seed in seeds],
             self._policy,
             backend="ray",
             sync=True,
@@ -125,9 +122,9 @@ class RayRollouts:
 def _worker_env(
     make_env: Callable[..., TransformedEnv],
     num_envs: int,
-    seed: int,
     primers: Transform | None,
     spread: bool,
+    seed: int,
 ) -> TransformedEnv:
     """Build the environment of a worker, in it; actions are drawn from torch's generator there."""
     torch.manual_seed(seed)

@@ -13,6 +13,7 @@ from training.errors import UserError
 
 from evaluation.points import (
     FAULTS,
+    FIELDS,
     condition_name,
     missingness_kind,
     missingness_name,
@@ -70,13 +71,8 @@ def parse_condition(text: str, settings: DictConfig) -> Condition:
     values = read_fields(family, words)
     if values is None:
         raise UserError(
-            "`points` must hold trained or mechanism:eta such as mcar:0.5, with one of none, mcar, "
-            "mar, nmar and eta in [0, 1], outages:eta:mean_length[:sensor, joint or kind], "
-            "delay:steps[:most[:sensor, joint or kind[:in_order]]], "
-            "multi_rate:period[:sensor, joint or kind[:phase]], "
-            "reduction:ratio:model or random, noise:sigma, spikes:probability[:std], "
-            "stuck:probability[:mean_length[:sensor, joint or kind]] or drift:std[:rate]; "
-            f"got {text!r}."
+            f"`points` must hold trained, or one of {', '.join(FIELDS)} with its numbers, such as "
+            f"mcar:0.5 (conf/evaluate.yaml shows each), got {text!r}."
         )
     if family in ("noise", *FAULTS):
         name = condition_name(family, values)

@@ -15,17 +15,12 @@ def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
     for text in [wanted] if isinstance(wanted, str) else wanted or []:
         if Path(text).is_dir():  # no pattern, whatever its name holds
             found.append(Path(text))
-        elif glob.has_magic(text):
-            matches = [Path(path) for path in glob.glob(text, recursive=True)]
-            runs = [path for path in matches if (path / "config.yaml").is_file()]
-            if not runs:
-                raise UserError(f"`run` must name run folders, {text} matches none.")
-            found += runs
-        else:
-            raise UserError(
-                f"`run` must name run folders, there is no folder {text}: give the one that "
-                "ppo_drbpn.py printed."
-            )
+            continue
+        matches = [Path(path) for path in glob.glob(text, recursive=True)]
+        runs = [path for path in matches if (path / "config.yaml").is_file()]
+        if not runs:
+            raise UserError(f"`run` must name run folders, none is at {text}; runs print theirs.")
+        found += runs
     if not found:
         raise UserError("`run` must name run folders: run=<folder>, run=[a,b] or 'run=runs/*'.")
     # One folder given twice, by a name and by a pattern, is one run.

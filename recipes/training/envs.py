@@ -238,40 +238,31 @@ def _groups(id: str, version: str | None, by: str) -> list[list[int]] | None:
 class SpreadEpisodes(RandomTruncationTransform):
     """Cut the first episode of every simulator at a random step, no other one.
 
-    Simulators of a robot that never falls would begin all their episodes in one rollout of many:
-    each update would see one phase of the episode, and beginnings would be forgotten in between
-    (staggered resets, [Bharthulwar et al. 2025]).
+    Robots that never fall would begin all their episodes in one rollout of many, and what is
+    learned of beginnings be forgotten in between (staggered resets, [Bharthulwar et al. 2025]).
     """
 
-    def __init__(self, horizon: int) -> None:
-        super().__init__(1, horizon)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        if tensordict.get("_reset", None) is None:  # all begin anew: a run starts, or starts again
+    def _reset(self, before: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if before.get("_reset", None) is None:  # all begin anew: a run starts, or starts again
             self._initialized = False
-        return super()._reset(tensordict, tensordict_reset)
+        return super()._reset(before, tensordict_reset)
 
-    def get_extra_state(self) -> dict[str, Tensor]:
+    def get_extra_state(self) -> Tensor | None:
         """Return the steps at which episodes are cut: a resumed run goes on with them."""
-        return {} if self._horizons is None else {"horizons": self._horizons.clone()}
+        return self._horizons
 
-    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+    def set_extra_state(self, state: Tensor | None) -> None:
         """Take up what :meth:`get_extra_state` returned."""
-        if "horizons" in state:
-            self._horizons, self._initialized = state["horizons"].clone(), True
-            self._first_episode = torch.ones_like(self._horizons, dtype=torch.bool)
+        if state is not None:
+            self._horizons, self._initialized = state.clone(), True
+            self._first_episode = torch.ones_like(state, dtype=torch.bool)
 
 
 def spread_episodes(env: TransformedEnv) -> None:
-    """Let the episodes of a batch of Gymnasium's simulators end at different steps.
-
-    TorchRL's other environments do not tell how long an episode may be.
-    """
+    """Spread the episodes of Gymnasium's tasks; other environments do not tell their longest."""
     simulators = env.base_env
     if isinstance(simulators, GymnasiumBatchEnv | EnvPoolBatchEnv) and simulators.max_episode_steps:
-        env.append_transform(SpreadEpisodes(simulators.max_episode_steps))
+        env.append_transform(SpreadEpisodes(1, simulators.max_episode_steps))
 
 
 def make_collector(
