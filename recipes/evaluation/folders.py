@@ -19,7 +19,7 @@ def find_folders(wanted: str | Sequence[str] | None) -> list[Path]:
         matches = [Path(path) for path in glob.glob(text, recursive=True)]
         runs = [path for path in matches if (path / "config.yaml").is_file()]
         if not runs:
-            raise UserError(f"`run` must name run folders, none is at {text}; runs print theirs.")
+            raise UserError(f"`run` must name run folders, none is at {text}: look in runs/.")
         found += runs
     if not found:
         raise UserError("`run` must name run folders: run=<folder>, run=[a,b] or 'run=runs/*'.")

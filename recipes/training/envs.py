@@ -240,6 +240,7 @@ class SpreadEpisodes(RandomTruncationTransform):
 
     Robots that never fall would begin all their episodes in one rollout of many, and what is
     learned of beginnings be forgotten in between (staggered resets, [Bharthulwar et al. 2025]).
+    TorchRL's horizons are in no state_dict of its own: this alone knows their private names.
     """
 
     def _reset(self, before: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
