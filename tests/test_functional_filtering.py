@@ -94,26 +94,6 @@ def test_stepping_through_time_equals_the_whole_sequence(state, obs, form, propa
     assert_same(problem, stepped, problem.library(form))
 
 
-@pytest.mark.parametrize("stored", [False, True], ids=["a reset", "a stored state"])
-@pytest.mark.parametrize("form", FORMS)
-def test_a_reset_inside_a_sequence_equals_two_sequences(form, stored):
-    problem, cut = Problem(3, 5, resets=False, stored=stored), 3
-    begins = torch.zeros_like(problem.reset)
-    begins[:, cut] = True
-    # The belief that a second sequence is handed must not matter if its first step is a reset.
-    mean, *rest = problem.arguments()
-    start = 50 + mean
-    if stored:
-        problem.use_stored, start = begins, problem.leaves["stored_mean"][:, cut]
-    else:
-        problem.reset = rest[-1] = begins
-    whole = problem.library(form)
-    first = problem.run(form, mean, *(x[:, :cut] for x in rest), return_cov=True)
-    second = problem.run(form, start, *(x[:, cut:] for x in rest), return_cov=True)
-    for a, b, c in zip(whole, first, second, strict=True):
-        assert_equal(a, torch.cat([b, c], 1))
-
-
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("shape", [(), (1,), (6,), (2, 3), (3, 1, 2)], ids=str)
 def test_the_batch_shape_does_not_matter(shape, form):
@@ -138,22 +118,6 @@ def test_memory_layout_does_not_matter(form):
     assert_same(problem, problem.library(form), problem.oracle())
 
 
-@covariances
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_nothing_observed_leaves_the_predicted_belief_and_likelihood_zero(
-    state, obs, form, propagated
-):
-    problem = Problem(state, obs, propagated=propagated)
-    problem.observed = torch.zeros_like(problem.observed)
-    out = problem.library(form)
-    assert not out.log_likelihood.any()
-    assert_same(problem, out, problem.oracle())  # which deletes every row
-    gradients = problem.gradients(out)
-    for name in ("observation", "noise", "matrix", "action_matrix", "bias"):
-        assert not gradients[name].any(), name
-
-
 @pytest.mark.parametrize("junk", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("form", FORMS)
 def test_what_lies_under_a_false_mask_changes_nothing_and_has_zero_gradient(form, junk):
@@ -171,16 +135,6 @@ def test_what_lies_under_a_false_mask_changes_nothing_and_has_zero_gradient(form
         assert torch.equal(gradient, clean_gradients[name]), name
     unseen = gradients["observation"][~problem.observed]
     assert torch.equal(unseen, torch.zeros_like(unseen))
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_covariances_are_computed_only_where_asked_for(form):
-    problem = Problem(3, 5)
-    out = problem.run(form)
-    assert out.cov is None
-    asked = problem.run(form, return_cov=True)
-    assert torch.equal(asked.mean, out.mean)
-    assert_equal(asked.cov, problem.oracle()[1])
 
 
 @covariances

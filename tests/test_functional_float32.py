@@ -4,10 +4,10 @@ from functools import partial
 
 import pytest
 import torch
-from filter_problems import FORMS, SIZES, Problem
+from filter_problems import FORMS, Problem
 
 from torchrl_drbpn import functional as F
-from torchrl_drbpn.functional import Belief, filter_step
+from torchrl_drbpn.functional import Belief
 
 
 def at_the_noise_floor(state, obs, *, full_noise=False, rank=None, spread=0.3):
@@ -91,25 +91,6 @@ def test_a_single_sensor_has_its_gradient_by_r(form):
     assert float(((found - expected) / expected).abs().max()) < 1e-3
 
 
-@pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
-@pytest.mark.parametrize(("state", "obs"), [(8, 27), (17, 17), (16, 105)], ids=str)
-def test_a_float32_step_keeps_its_digits_at_the_noise_floor(state, obs, full_noise):
-    single, double = at_the_noise_floor(state, obs, full_noise=full_noise)
-    outputs = []
-    for problem in (single, double):
-        mean, action, x, observed, reset = problem.arguments()
-        # Every step of the sequence at once, each from the same belief.
-        mean = mean.unsqueeze(1).expand(*reset.shape, state)
-        outputs.append(
-            filter_step(problem.model(), mean, action, x, observed, reset, return_cov=True)
-        )
-    mean, cov, ll = (a.detach().double() - b.detach() for a, b in zip(*outputs, strict=True))
-    assert float(mean.abs().max()) < 1e-3
-    assert float(cov.abs().max()) < 1e-5
-    relative = ll.abs() / outputs[1].log_likelihood.detach().abs().clamp(min=10)
-    assert float(relative.max()) < 1e-3
-
-
 def smallest_eigenvalues(cov):
     assert torch.isfinite(cov).all()
     assert torch.equal(cov, cov.mT)
@@ -117,14 +98,14 @@ def smallest_eigenvalues(cov):
 
 
 def a_step(state, obs, batch, seed, *, full_noise):
-    """H, Q of std .3, R of std 1e-2 and a predicted belief of covariance Q."""
+    """H, R of std 1e-2, and a predicted belief of covariance Q of std .3."""
     g = torch.Generator().manual_seed(seed)
     h, q, r = torch.randn(obs, state, generator=g), 0.09 * torch.eye(state), 1e-4 * torch.eye(obs)
     if full_noise:
         rotation = torch.linalg.qr(torch.randn(obs, obs, generator=g))[0]
         r = 1e-4 * (rotation * torch.linspace(1, 100, obs)) @ rotation.T
         r = (r + r.T) / 2
-    return h, q, r, Belief(torch.zeros(batch, state), q.expand(batch, state, state)), g
+    return h, r, Belief(torch.zeros(batch, state), q.expand(batch, state, state)), g
 
 
 @pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
@@ -135,7 +116,7 @@ def test_float32_covariances_are_symmetric_positive_definite_at_the_noise_floor(
     state, obs, full_noise
 ):
     for seed in range(3):
-        h, _, r, belief, g = a_step(state, obs, 64, seed, full_noise=full_noise)
+        h, r, belief, g = a_step(state, obs, 64, seed, full_noise=full_noise)
         observed = torch.rand(64, obs, generator=g) < torch.linspace(0, 1, 64)[:, None]
         step = (belief, torch.randn(64, obs, generator=g), observed, h, r)
         mean, cov = F.update(*step)
@@ -143,26 +124,6 @@ def test_float32_covariances_are_symmetric_positive_definite_at_the_noise_floor(
         assert smallest_eigenvalues(cov).min() > 0
         assert mean.isfinite().all()
         assert F.log_likelihood(*step).isfinite().all()
-
-
-@pytest.mark.parametrize("predicts", [True, False], ids=["predict+update", "update"])
-@pytest.mark.parametrize(("state", "obs"), SIZES)
-def test_float32_covariances_survive_10000_iterations(state, obs, predicts):
-    h, q, r, belief, g = a_step(state, obs, 4, 0, full_noise=False)
-    masks = torch.rand(50, 4, obs, generator=g) < 0.5
-    x = torch.randn(50, 4, obs, generator=g)
-    jacobian = 0.99 * torch.linalg.qr(torch.randn(state, state, generator=g))[0]
-    moves = (lambda m, _: m @ jacobian.T, q, torch.zeros(4, 1))
-    history = []
-    with torch.no_grad():
-        for i in range(10_000):
-            if predicts:
-                belief = F.predict(belief, *moves, jacobian=jacobian)
-            belief = F.update(belief, x[i % 50], masks[i % 50], h, r)
-            history.append(belief.cov)
-    assert torch.isfinite(belief.mean).all()
-    bad = (smallest_eigenvalues(torch.stack(history)).amin(-1) <= 0).nonzero()
-    assert not len(bad), f"indefinite in {len(bad)} of 10,000 iterations, first at {int(bad[0])}"
 
 
 @pytest.mark.parametrize("dead", [False, True], ids=["random masks", "a sensor dead for good"])

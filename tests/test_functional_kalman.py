@@ -14,48 +14,24 @@ from torchrl_drbpn.functional.gaussian import inverse_softplus, positive_std
 sized = pytest.mark.parametrize(
     ("state", "obs"), [(3, 5), (4, 4), (6, 4)], ids=["state<obs", "state=obs", "state>obs"]
 )
-seeded = pytest.mark.parametrize("seed", [0, 1, 2])
 FUNCTIONS = ["innovation", "update", "log_likelihood"]
 
 
-def given(state, obs, *, seed=0, full_noise=True):
+def given(state, obs, *, full_noise=True):
     """The arguments of a step, whose rows observe one entry, all, some and none; a generator."""
-    system = references.random_system(state, obs, seed=seed, full_noise=full_noise)
-    g = torch.Generator().manual_seed(seed + 77)
+    system = references.random_system(state, obs, full_noise=full_noise)
+    g = torch.Generator().manual_seed(77)
     mean = torch.randn(5, state, generator=g, dtype=torch.float64)
     cov = torch.stack([references.spd(state, g) for _ in range(5)])
     x = 2 * torch.randn(5, obs, generator=g, dtype=torch.float64)
     offset = torch.randn(5, obs, generator=g, dtype=torch.float64)
     observed = torch.rand(5, obs, generator=g) < 0.6
-    observed[0], observed[1], observed[2] = torch.arange(obs) == seed, True, False
+    observed[0], observed[1], observed[2] = torch.arange(obs) == 0, True, False
     return (Belief(mean, cov), x, observed, system.matrix, system.noise, offset), g
 
 
 def vector(*values):
     return torch.tensor(values, dtype=torch.float64)
-
-
-@seeded
-@sized
-def test_masking_an_entry_equals_deleting_its_row_in_values_and_gradients(state, obs, seed):
-    (belief, x, observed, h, r, offset), g = given(state, obs, seed=seed)
-    # Covariances enter through a factor: no gradient depends on the triangle that a formula reads.
-    roots = torch.linalg.cholesky(belief.cov), torch.linalg.cholesky(r)
-    leaves = [t.clone().requires_grad_() for t in (belief.mean, roots[0], x, h, roots[1], offset)]
-    mean, root_p, x, h, root_r, offset = leaves
-    cov, r = root_p @ root_p.mT, root_r @ root_r.mT
-    actual = outputs(Belief(mean, cov), x, observed, h, r, offset)[2:]
-    rows = [(mean[i], cov[i], x[i], observed[i], h, r, offset[i]) for i in range(len(x))]
-    each = [(*references.update(*row), references.log_likelihood(*row)) for row in rows]
-    expected = [torch.stack(part) for part in zip(*each, strict=True)]
-    weights = [torch.randn(e.shape, generator=g, dtype=torch.float64) for e in expected]
-    totals = [
-        sum((w * (t + t.square())).sum() for w, t in zip(weights, out, strict=True))
-        for out in (actual, expected)
-    ]
-    gradients = [torch.autograd.grad(total, leaves, retain_graph=True) for total in totals]
-    for a, e in zip((*actual, *gradients[0]), (*expected, *gradients[1]), strict=True):
-        assert_equal(a, e)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
@@ -112,20 +88,6 @@ def propagated(system, x, observed, action, belief):
         yield predicted, belief, F.log_likelihood(*step)
 
 
-@seeded
-@sized
-def test_step_likelihoods_sum_to_one_joint_gaussian_when_the_covariance_is_propagated(
-    state, obs, seed
-):
-    system = references.random_system(state, obs, seed=seed, full_noise=True)
-    data = references.simulate(system, batch=1, time=6, seed=seed)
-    rows = data.observation[0], data.observed[0], data.previous_action[0]
-    steps = propagated(system, *rows, Belief(system.initial_mean, system.initial_cov))
-    mean, prior, H, R, x = references.joint_gaussian(system, data, row=0)
-    joint = torch.distributions.MultivariateNormal(H @ mean, H @ prior @ H.mT + R)
-    assert_equal(sum(ll for *_, ll in steps), joint.log_prob(x))
-
-
 def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagated():
     system = references.random_system(3, 5, seed=4, full_noise=True)
     data = references.simulate(system, batch=1, time=30, seed=4)
@@ -136,16 +98,6 @@ def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagate
         assert_equal(filtered.mean, torch.from_numpy(truth.filtered_state[:, t]), 1e-8)
         assert_equal(filtered.cov, torch.from_numpy(truth.filtered_state_cov[:, :, t]), 1e-8)
         assert_equal(ll, torch.tensor(truth.llf_obs[t], dtype=torch.float64), 1e-8)
-
-
-def test_inputs_are_left_as_they_were():
-    (belief, x, observed, *model), _ = given(3, 5)
-    inputs = (*belief, torch.where(observed, x, math.nan), observed, *model)
-    before = [t.clone() for t in inputs]
-    outputs(belief, *inputs[2:])
-    F.predict(belief, lambda m, _: m, torch.eye(3).double(), torch.zeros(5, 2), jacobian=None)
-    for a, b in zip(inputs, before, strict=True):
-        assert torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0))
 
 
 def test_variances_are_a_diagonal_covariance_and_never_a_row():

@@ -135,4 +135,6 @@ def test_every_form_of_a_sequence_is_the_oracle(state, obs, share, seed, **optio
     problem.observed = torch.rand(problem.observed.shape, generator=g) < share
     expected = problem.oracle()
     for form in ("pytorch", "step by step", *(["native"] if F.native_status() is None else [])):
-        assert_near(problem.library(form), expected)
+        found = problem.library(form)
+        assert_near(found, expected)
+        assert not found.log_likelihood[~problem.observed.any(-1)].any()  # exactly 0

@@ -9,7 +9,6 @@ from filter_problems import Problem, assert_equal, sequences, space
 
 from torchrl_drbpn import BeliefFilter
 from torchrl_drbpn.functional import Belief, forecast, smooth_sequence
-from torchrl_drbpn.functional.smoothing import row_jacobian
 
 
 def linear(time=7, *, batch=3, reset_rate=0.3, seed=0):
@@ -190,19 +189,6 @@ def test_a_filter_ends_in_its_smoothed_belief_and_forecasts_what_it_predicts(jac
     x[0, 0, observed[0, 0].nonzero()[0]] = math.nan
     with pytest.raises(ValueError, match="`observation` holds NaN"):
         module.smooth(*sequence)
-
-
-@pytest.mark.parametrize("closed", [False, True])
-def test_the_row_wise_jacobian_is_that_of_autograd_and_can_be_differentiated(closed):
-    network, mean = Problem(3, 4).model().transition, torch.randn(2, 3, dtype=torch.float64)
-    f = network if closed else lambda m, a: network(m, a)
-    action = torch.randn(2, 2, dtype=torch.float64)
-    found = row_jacobian(f, mean, action)
-    for row in range(2):
-        F = torch.autograd.functional.jacobian(lambda m, r=row: f(m, action[r]), mean[row])
-        assert_equal(found[row], F)
-    mean.requires_grad_()
-    assert torch.autograd.gradcheck(lambda m: row_jacobian(f, m, action), mean)
 
 
 def test_bad_input_is_named_and_no_step_is_no_error():
