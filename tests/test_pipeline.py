@@ -1,4 +1,4 @@
-"""Belief modules in a GRU's place: TorchRL's collector, GAE and ClipPPOLoss, one code for all."""
+"""Belief modules in a GRU's place: TorchRL's collector, GAE, ClipPPOLoss, stacked parameters."""
 
 import functools
 
@@ -6,34 +6,28 @@ import pytest
 import torch
 from particle_tools import make_filter as make_particles
 from small_agents import ACTION, GAMMA, LMBDA, OBS, TIME, collect, make_agent, make_filter, make_gae
-from tensordict import TensorDict, pad
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs.utils import step_mdp
-from torchrl.modules import GRUModule, set_recurrent_mode
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from torchrl_drbpn import BeliefFilterModule, BeliefModelLoss, DRBPNLoss, ParticleFilterModule
+from torchrl_drbpn import BeliefFilterModule, ParticleFilterModule
 
 DTYPE, HIDDEN = torch.float32, 6
-
-
-def gru(**kwargs):
-    out_keys = ["features", ("next", "recurrent_state")]
-    keys = {"in_keys": ["observation", "recurrent_state", "is_init"], "out_keys": out_keys}
-    return GRUModule(input_size=OBS, hidden_size=HIDDEN, **keys)
 
 
 def belief_filter(**kwargs):
     return BeliefFilterModule(make_filter(OBS, ACTION, DTYPE, state=HIDDEN), **kwargs)
 
 
-def particle_filter(**kwargs):
-    return ParticleFilterModule(make_particles(OBS, ACTION), **kwargs)
+def particle_filter():
+    return ParticleFilterModule(make_particles(OBS, ACTION))
 
 
-EVERY = pytest.mark.parametrize("make_module", [gru, belief_filter, particle_filter])
+EVERY = pytest.mark.parametrize("make_module", [belief_filter, particle_filter])
 
 
 @functools.cache
@@ -52,16 +46,11 @@ def test_on_fresh_data_the_ratio_and_the_effective_sample_size_are_one(make_modu
     assert not data["is_init"][:, 0].all()
     with set_recurrent_mode(True), torch.no_grad():
         make_gae(agent)(data)
-    outputs = [ClipPPOLoss(agent.policy, agent.value)(data)]
-    if make_module is not gru:
-        ppo = ClipPPOLoss(agent.actor, agent.critic)
-        outputs.append(DRBPNLoss(agent.belief, ppo, BeliefModelLoss())(data))
-        assert outputs[1]["loss_model"].isfinite()
-    for out in outputs:
-        torch.testing.assert_close(out["ESS"], torch.ones_like(out["ESS"]), rtol=1e-4, atol=0)
-        assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
-        assert out["mean_ratio"].item() == pytest.approx(1, abs=1e-4)
-        assert out["kl_approx"].item() == pytest.approx(0, abs=1e-4)
+    out = ClipPPOLoss(agent.policy, agent.value)(data)
+    torch.testing.assert_close(out["ESS"], torch.ones_like(out["ESS"]), rtol=1e-4, atol=0)
+    assert out["max_ratio"].item() == pytest.approx(1, abs=1e-4)
+    assert out["mean_ratio"].item() == pytest.approx(1, abs=1e-4)
+    assert out["kl_approx"].item() == pytest.approx(0, abs=1e-4)
 
 
 @pytest.mark.parametrize("shifted", [False, True])
@@ -89,51 +78,17 @@ def test_gae_reads_the_values_of_stored_and_next_beliefs(make_module, shifted):
     torch.testing.assert_close(through["value_target"], target, rtol=limit, atol=limit * scale)
 
 
-# What TorchRL's own tests ask of GRUModule, asked of all three.
-BARE = {"in_keys": {"observed": None, "previous_action": None}}
-without_a_primer = pytest.mark.filterwarnings("ignore:.*make_tensordict_primer:UserWarning")
-
-
-def frames(*shape):
-    value, is_init = torch.ones(*shape, OBS).cumsum(-2), torch.zeros(*shape, 1, dtype=torch.bool)
-    return TensorDict({"observation": value, "is_init": is_init}, shape)
-
-
-@without_a_primer
-@EVERY
-def test_padded_data_are_taken(make_module):
-    padded = pad(frames(3), [0, 5])
-    assert make_module(**BARE)(padded)["features"].shape == (8, HIDDEN)
-
-
-@without_a_primer
-@EVERY
-@pytest.mark.parametrize("shape", [(), (2,), (2, 3)], ids=str)
-def test_a_sequence_with_starts_inside_equals_its_steps(make_module, shape):
-    # test_multi_consecutive of GRUModule: sequences in one call, then the same step by step
-    module = make_module(**BARE)
-    data = frames(*shape, TIME)
-    data["is_init"][(0,) * len(shape) + (TIME // 2,)] = True
-    with set_recurrent_mode(True):
-        whole = module(data.clone())
-    step = frames(*shape, 1)[..., 0].select("observation", "is_init")
-    for t in range(TIME):
-        step.update(data[..., t])
-        step = step_mdp(module(step), keep_other=True)
-    torch.testing.assert_close(
-        step["features"], whole["features"][..., -1, :], rtol=1e-4, atol=1e-5
-    )
-
-
-@without_a_primer
+@pytest.mark.filterwarnings("ignore:.*make_tensordict_primer:UserWarning")
 @pytest.mark.parametrize("over_time", [False, True])
 def test_vmap_over_stacked_parameters_is_a_loop(over_time):
-    # PyTorch's fused GRU, in GRUModule and over particles, has no batching rule
+    # PyTorch's fused GRU, over particles, has no batching rule
+    bare = belief_filter(in_keys={"observed": None, "previous_action": None})
     embed = TensorDictModule(nn.Linear(OBS, OBS), ["raw"], ["observation"])
     head = TensorDictModule(nn.Linear(HIDDEN, 2), ["features"], ["out"])
-    model = TensorDictSequential(embed, belief_filter(**BARE), head)
-    data = frames(5, 6).rename_key_("observation", "raw")
-    data["is_init"][1, 3] = True
+    model = TensorDictSequential(embed, bare, head)
+    value, is_init = torch.ones(5, 6, OBS).cumsum(-2), torch.zeros(5, 6, 1, dtype=torch.bool)
+    is_init[1, 3] = True
+    data = TensorDict({"raw": value, "is_init": is_init}, [5, 6])
     params = TensorDict.from_module(model).detach()
     stacked = torch.stack([params, params * 0.9])
 
