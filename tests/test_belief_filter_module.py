@@ -90,20 +90,6 @@ def test_the_keys_are_those_of_the_design_and_a_list_renames_them_by_position():
     assert set(module.make_tensordict_primer().primers.keys(True, True)) == {"f", ("g", "h")}
 
 
-def test_the_recurrent_state_can_be_renamed_and_carries_the_belief():
-    names = {("recurrent", "mean"): ("agent", "hidden"), ("recurrent", "age"): "count"}
-    plain = BeliefFilterModule(make_filter(dtype=torch.float64))
-    named = BeliefFilterModule(make_filter(dtype=torch.float64), in_keys=names)
-    data = with_state(make_frames((3,)), OBS)
-    expected = plain(data.clone())
-    for old, new in names.items():
-        data.rename_key_(old, new)
-    received = named(data)
-    assert torch.equal(received["features"], expected["features"])
-    assert torch.equal(received["next", "agent", "hidden"], expected["next", "recurrent", "mean"])
-    assert torch.equal(received["next", "count"], expected["next", "recurrent", "age"])
-
-
 def test_out_keys_as_a_list_or_a_dict_choose_what_is_written_and_computed(monkeypatch):
     data = with_state(make_frames((3,)), OBS)
     make = functools.partial(make_filter, dtype=torch.float64)
@@ -207,19 +193,6 @@ def test_mean_cov_features_are_the_mean_and_the_lower_triangle():
     row, column = torch.tril_indices(3, 3)
     expected = torch.cat([out["belief", "mean"], out["belief", "cov"][:, row, column]], -1)
     assert torch.equal(out["features"], expected)
-
-
-@pytest.mark.parametrize("age", [0, 3])
-def test_the_initial_belief_is_learned_from_episode_starts_and_not_in_mid_episode(age):
-    for key in ("features", ("belief", "log_likelihood")):
-        module = BeliefFilterModule(make_filter(dtype=torch.float64))
-        data = with_state(make_frames((3, 5)), OBS)
-        data["is_init"][:, 0], data["recurrent", "age"][:, 0] = True, age
-        with set_recurrent_mode(True):
-            module(data)[key].square().sum().backward()
-        for parameter in (module.filter.initial_mean, module.filter.initial_noise.raw):
-            learned = parameter.grad is not None and parameter.grad.abs().max() > 1e-3
-            assert learned == (age == 0)
 
 
 def test_autocast_leaves_the_filter_in_its_own_dtype():

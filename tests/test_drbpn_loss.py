@@ -110,15 +110,6 @@ def test_one_pass_over_time_and_one_step_for_the_last_observations():
     torch.testing.assert_close(out["loss_model"], -data["belief", "log_likelihood"])
 
 
-@pytest.mark.slow
-def test_compiled_ahead_of_time_the_gradients_are_the_same():
-    agent, data = make_belief_agent(), make_data()
-    loss = make_loss(agent)
-    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    grads = [gradients(agent, summed(out)) for out in (loss(data), compiled(data))]
-    torch.testing.assert_close(*grads, rtol=1e-9, atol=1e-12)
-
-
 @built
 @filters
 @pytest.mark.parametrize("functional", [True, False])

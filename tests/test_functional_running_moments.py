@@ -62,16 +62,6 @@ def test_with_fewer_than_two_values_the_spread_is_one(seen):
     assert spread(masked_moments(value, observed), EPS).item() == 1.0
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.9])
-@pytest.mark.parametrize("learned", [False, True], ids=["first", "later"])
-def test_readings_of_a_normal_sensor_are_left_as_they_are(missing, learned):
-    value, observed = draw(2000, 3, missing=missing)
-    before = masked_moments(*draw(500, 3, seed=1)) if learned else nothing()
-    bounded, counted = winsorize(value, observed, before, EPS)
-    assert torch.equal(counted, observed)
-    assert torch.equal(bounded[observed], value[observed])
-
-
 def test_a_sensor_that_rarely_speaks_is_learned():
     value = torch.zeros(2000, 1, dtype=torch.float64)
     value[::100] = 1.0  # one reading in a hundred
