@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from recipe_tools import ROOT, printed
+from transform_cases import CASES
 
 DOCS = ROOT / "docs"
 PACKAGE = ROOT / "torchrl_drbpn"
@@ -129,15 +130,12 @@ def test_notation_names_the_keys_that_are_read_and_written():
     module = package.BeliefFilterModule(package.BeliefFilter(3, 2))
     text = (DOCS / "notation.md").read_text(encoding="utf-8")
     keys = [*module.in_keys, *module.out_keys, *package.BeliefModelLoss().out_keys]
-    transforms = {  # required arguments, where there are some
-        "ObservationDelay": (1,), "ObservationMissingness": ("mcar", 0.5),
-        "ObservationMultiRate": (2,), "ObservationNoise": (0.1,), "ObservationSpikes": (0.1, 5.0),
-        "SensorOutages": (0.5, 5), "SensorReduction": ([0],), "StuckSensors": (0.1,),
-    }  # fmt: skip
-    room = importlib.import_module("torchrl_drbpn.transforms")
-    for name in set(room.__all__) - {"seed_env"}:
+    transforms = [case.make() for case in CASES.values()]
+    names = {type(transform).__name__ for transform in transforms}
+    assert names == set(package.transforms.__all__) - {"seed_env"}
+    for name in names:
         assert f"`{name}`" in text, name
-        transform = getattr(room, name)(*transforms.get(name, ()))
+    for transform in transforms:
         keys += [*transform.in_keys, *transform.out_keys, *getattr(transform, "state_keys", [])]
     for key in keys:
         spelt = key if isinstance(key, str) else str(tuple(key)).replace("'", '"')
