@@ -97,35 +97,6 @@ def smallest_eigenvalues(cov):
     return torch.linalg.eigvalsh(cov.double())[..., 0]
 
 
-def a_step(state, obs, batch, seed, *, full_noise):
-    """H, R of std 1e-2, and a predicted belief of covariance Q of std .3."""
-    g = torch.Generator().manual_seed(seed)
-    h, q, r = torch.randn(obs, state, generator=g), 0.09 * torch.eye(state), 1e-4 * torch.eye(obs)
-    if full_noise:
-        rotation = torch.linalg.qr(torch.randn(obs, obs, generator=g))[0]
-        r = 1e-4 * (rotation * torch.linspace(1, 100, obs)) @ rotation.T
-        r = (r + r.T) / 2
-    return h, r, Belief(torch.zeros(batch, state), q.expand(batch, state, state)), g
-
-
-@pytest.mark.parametrize("full_noise", [False, True], ids=["diagonal R", "full R"])
-@pytest.mark.parametrize(
-    ("state", "obs"), [(4, 17), (17, 17), (32, 17), (1, 1), (16, 105), (32, 8)], ids=str
-)
-def test_float32_covariances_are_symmetric_positive_definite_at_the_noise_floor(
-    state, obs, full_noise
-):
-    for seed in range(3):
-        h, r, belief, g = a_step(state, obs, 64, seed, full_noise=full_noise)
-        observed = torch.rand(64, obs, generator=g) < torch.linspace(0, 1, 64)[:, None]
-        step = (belief, torch.randn(64, obs, generator=g), observed, h, r)
-        mean, cov = F.update(*step)
-        assert cov.dtype == torch.float32
-        assert smallest_eigenvalues(cov).min() > 0
-        assert mean.isfinite().all()
-        assert F.log_likelihood(*step).isfinite().all()
-
-
 @pytest.mark.parametrize("dead", [False, True], ids=["random masks", "a sensor dead for good"])
 @pytest.mark.parametrize(("state", "obs"), [(17, 17), (32, 8)], ids=str)
 def test_float32_updates_of_a_correlated_belief_stay_positive_definite(state, obs, dead):
