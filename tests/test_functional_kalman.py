@@ -100,6 +100,16 @@ def test_it_equals_statsmodels_with_missing_entries_and_the_covariance_propagate
         assert_equal(ll, torch.tensor(truth.llf_obs[t], dtype=torch.float64), 1e-8)
 
 
+def test_exact_sensors_under_a_vast_prior_cost_the_covariance_no_digits():
+    """Joseph's form: P - K H P is off by 2 % here, in float64."""
+    system = references.random_system(6, 6)
+    prior, noise = 1e6 * torch.eye(6).double(), 1e-8 * torch.eye(6).double()
+    zeros, seen = torch.zeros(6).double(), torch.ones(6, dtype=torch.bool)
+    cov = F.update(Belief(zeros, prior), zeros, seen, system.matrix, noise).cov
+    expected = torch.linalg.inv(prior.inverse() + system.matrix.T @ noise.inverse() @ system.matrix)
+    torch.testing.assert_close(cov, expected, rtol=1e-9, atol=1e-18)
+
+
 def test_variances_are_a_diagonal_covariance_and_never_a_row():
     belief, x = Belief(torch.zeros(2), torch.ones(2)), torch.tensor([1.0, 2.0])
     seen, eye, r = torch.ones(2, dtype=torch.bool), torch.eye(2), torch.tensor([0.1, 0.2])
