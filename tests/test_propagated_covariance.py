@@ -6,6 +6,7 @@ import pytest
 import references
 import torch
 from filter_problems import TOLERANCE, Problem, assert_equal, by_hand, sequences, space
+from tensordict import TensorDict
 from torch import nn
 
 from torchrl_drbpn import BeliefFilter, GaussianTransition
@@ -89,32 +90,29 @@ def test_the_closed_form_jacobian_is_that_of_autograd(hidden, activation, residu
     assert_equal(f.jacobian(mean, action, average=True), rows.mean((0, 1)), 1e-12)
 
 
-def test_a_fresh_filter_sets_its_jacobian_once_and_it_is_saved_with_it():
-    filter, data = BeliefFilter(5, 2, 3, covariance="propagated").double(), sequences(3, (4,))
-    inputs = data._replace(mean=0 * data.mean, cov=torch.zeros(4, 3, 3).double())
-    first = filter(*inputs)
-    jacobian = filter.mean_jacobian.clone()
-    assert jacobian.isfinite().all()
-    with torch.no_grad():
-        filter.transition.layers[0].weight.mul_(3)
-    filter(*inputs)
-    assert torch.equal(filter.mean_jacobian, jacobian)
-
-    other = BeliefFilter(5, 2, 3, covariance="propagated").double()
-    other.load_state_dict(filter.state_dict())
-    again = other(*inputs)
-    assert torch.equal(other.mean_jacobian, jacobian)
-    assert not torch.equal(again.mean, first.mean)
+def test_the_jacobian_starts_at_the_initial_mean_and_is_state_like_any_other():
+    new, used = (BeliefFilter(5, 2, 3, covariance="propagated").double() for _ in range(2))
+    first = {name: value.clone() for name, value in new.state_dict().items()}
     mean, action = torch.randn(9, 3).double(), torch.randn(9, 2).double()
-    other.refresh_jacobian(mean, action)
-    expected = other.transition.mean_network().jacobian(mean, action).mean(0)
-    torch.testing.assert_close(other.mean_jacobian, expected)
-    other.reset_parameters()
-    other(*inputs)
-    expected = other.transition.mean_network().jacobian(
-        torch.zeros(3).double(), torch.zeros(2).double()
-    )
-    torch.testing.assert_close(other.mean_jacobian, expected)
+
+    def derivative(filter, *at):
+        return filter.transition.mean_network().jacobian(*at)
+
+    at_start = 0 * mean[0], 0 * action[0]
+    torch.testing.assert_close(new.mean_jacobian, derivative(new, *at_start))
+    used.refresh_jacobian(mean, action)
+    torch.testing.assert_close(used.mean_jacobian, derivative(used, mean, action).mean(0))
+    # what a collector does with the learner's weights, and a call of the filter after it
+    weights = TensorDict.from_module(new).data.update_(TensorDict.from_module(used).data)
+    inputs = sequences(3, (4,))
+    data = inputs._replace(cov=torch.eye(3).double().expand(4, 3, 3))
+    filtered = [filter(*data).mean for filter in (new, used)]
+    assert torch.equal(weights["mean_jacobian"], used.mean_jacobian)
+    assert torch.equal(*filtered)
+    used.load_state_dict(first)
+    assert torch.equal(used.mean_jacobian, first["mean_jacobian"])
+    used.reset_parameters()
+    torch.testing.assert_close(used.mean_jacobian, derivative(used, *at_start))
     with pytest.raises(ValueError, match="covariance='propagated'"):
         BeliefFilter(5, 2).refresh_jacobian(mean, action)
 

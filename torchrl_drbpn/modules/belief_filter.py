@@ -59,8 +59,8 @@ class BeliefFilter(nn.Module):
         covariance: "constant": the predicted covariance is Q whatever came before (eq. 8);
             "propagated": it is F cov F' + Q, with F the derivative of the transition, so that it
             grows while nothing arrives. Train as you act: each kind learns a Q of its own.
-        jacobian: what F is: "mean", the buffer that :meth:`refresh_jacobian` sets (the first call
-            of a fresh filter does, at initial_mean), so that all steps of a batch are filtered at
+        jacobian: what F is: "mean", the buffer that :meth:`refresh_jacobian` sets (of a new
+            filter the derivative at initial_mean), so that all steps of a batch are filtered at
             once; "row", the derivative at each belief, step by step.
         robust: "huber" or "imq" gives a reading that contradicts the prediction and the other
             readings a weight under 1 (:func:`~torchrl_drbpn.functional.innovation_weights`), in
@@ -139,9 +139,7 @@ class BeliefFilter(nn.Module):
         self.covariance, self.jacobian, self.validate = covariance, jacobian, validate
         self.robust, self.robust_threshold = robust, robust_threshold
         if covariance == "propagated":
-            nothing = torch.full((state_dim, state_dim), torch.nan, **place)
-            self.register_buffer("mean_jacobian", nothing)
-        self._fresh = False
+            self.register_buffer("mean_jacobian", torch.empty(state_dim, state_dim, **place))
         self.initial_mean = nn.Parameter(torch.zeros(state_dim, **place))
         self.initial_noise = LearnedCovariance(
             state_dim, initial_cov, initial_std, _MIN_INITIAL_STD, name="initial_cov", **place
@@ -150,8 +148,8 @@ class BeliefFilter(nn.Module):
         if mask_model:  # intercepts, slopes
             self.mask_model = nn.Parameter(torch.zeros(2, obs_dim, **place))
         check_robust(robust, robust_threshold, self.mask_model)
+        self._start_jacobian()
         self._check_model()
-        self._fresh = covariance == "propagated"
 
     def reset_parameters(self) -> None:
         """Start again, the parts included where they know how."""
@@ -162,12 +160,12 @@ class BeliefFilter(nn.Module):
             reset = getattr(part, "reset_parameters", None)
             if callable(reset):
                 reset()
-        self._fresh = self.covariance == "propagated"
+        self._start_jacobian()
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        saved = state_dict.get(f"{prefix}mean_jacobian")
-        self._fresh = self._fresh and (saved is None or bool(saved.isnan().any()))
+    def _start_jacobian(self) -> None:
+        if self.covariance == "propagated":
+            start = self.initial_mean.detach()
+            self.refresh_jacobian(start, start.new_zeros(self.action_dim))
 
     @property
     def initial_cov(self) -> Tensor:
@@ -182,9 +180,6 @@ class BeliefFilter(nn.Module):
             R, initial_cov = self.emission.compact_cov(), self.initial_noise.compact()
         F: Tensor | Callable[[Tensor, Tensor], Tensor] | None = None
         if self.covariance == "propagated" and self.jacobian == "mean":
-            if self._fresh:
-                start = self.initial_mean.detach()
-                self.refresh_jacobian(start, start.new_zeros(self.action_dim))
             F = self.mean_jacobian
         elif self.covariance == "propagated":
             F = functools.partial(jacobian_of, self.transition)
@@ -205,7 +200,6 @@ class BeliefFilter(nn.Module):
         if self.covariance != "propagated":
             raise ValueError("`refresh_jacobian` needs a filter with covariance='propagated'.")
         self.mean_jacobian.copy_(jacobian_of(self.transition, mean, previous_action, average=True))
-        self._fresh = False
 
     @torch.no_grad()
     def _check_model(self) -> None:
