@@ -67,6 +67,22 @@ class StaircaseEnv(EnvBase):
         del seed
 
 
+class AgentsEnv(StaircaseEnv):
+    """Two agents that see what StaircaseEnv shows, in a folder of their own."""
+
+    def __init__(self):
+        super().__init__()
+        shape = (*self.batch_size, 2)
+        leaf = self.observation_spec["observation"].unsqueeze(1).expand(*shape, OBS)
+        agents = Composite(observation=leaf, shape=shape)
+        self.observation_spec = Composite(agents=agents, shape=self.batch_size)
+
+    def _observe(self):
+        data = super()._observe()
+        seen = data.pop("observation").unsqueeze(1).repeat(1, 2, 1)
+        return data.set("agents", TensorDict({"observation": seen}, seen.shape[:-1]))
+
+
 def gym_env(name="InvertedPendulum-v5"):
     """Return a Gymnasium environment in float32, one process, batch size ()."""
     return TransformedEnv(GymEnv(name), DoubleToFloat())

@@ -7,6 +7,7 @@ from suite_beliefs import BeliefModuleSuite
 from suite_environments import (
     ACTION,
     OBS,
+    AgentsEnv,
     StaircaseEnv,
     gym_env,
     parallel_env,
@@ -18,6 +19,6 @@ from suite_losses import LossSuite
 from suite_recipe_beliefs import RecipeBeliefSuite
 
 __all__ = [
-    "ACTION", "OBS", "BeliefModuleSuite", "LossSuite", "RecipeBeliefSuite", "StaircaseEnv",
-    "gym_env", "parallel_env", "saved", "staircase", "vectors",
+    "ACTION", "OBS", "AgentsEnv", "BeliefModuleSuite", "LossSuite", "RecipeBeliefSuite",
+    "StaircaseEnv", "gym_env", "parallel_env", "saved", "staircase", "vectors",
 ]  # fmt: skip

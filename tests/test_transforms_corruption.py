@@ -130,6 +130,7 @@ def wrapped_twice(first, second):
     [
         (FillLastObserved, MISSING, "`FillLastObserved` stands before `ObservationMissingness`"),
         (FillLastObserved, ObservedFromNaN, "`FillLastObserved` stands before `ObservedFromNaN`"),
+        (FillLastObserved, NOISE, "`FillLastObserved` stands before `ObservationNoise`"),
         (NOISE, partial(MISSING, complete_key=COMPLETE), "has corrupted the observation before"),
         (
             partial(NOISE, complete_key=COMPLETE),
@@ -137,7 +138,7 @@ def wrapped_twice(first, second):
             "`complete_observation` is among the observations of the environment already",
         ),
     ],
-    ids=["fill", "fill NaN", "complete", "two writers"],
+    ids=["fill", "fill NaN", "fill noise", "complete", "two writers"],
 )
 @pytest.mark.parametrize("put_together", [staircase, nested, appended, inserted, wrapped_twice])
 def test_a_wrong_order_is_refused_at_the_first_use(before, after, message, put_together):

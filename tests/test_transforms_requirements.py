@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from suites import ACTION, OBS, StaircaseEnv, gym_env, parallel_env, saved
+from suites import ACTION, OBS, AgentsEnv, StaircaseEnv, gym_env, parallel_env, saved
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -262,6 +262,15 @@ def test_what_lies_under_a_false_mask_is_never_read(case):
         assert not results[-1]["observed"][:, 2].any()
         assert results[-1]["observation"].isfinite().all()
         assert_same(results[0], results[-1])
+
+
+@of_observations
+def test_what_it_carries_stands_with_the_agents_whose_sensors_they_are(case):
+    if not hasattr(case.make(), "state_keys"):
+        pytest.skip("carries nothing from step to step")
+    env = case.env(AgentsEnv(), in_keys=[("agents", "observation")])
+    check_env_specs(env)
+    assert env.rollout(2)["agents"].batch_size == (3, 2, 2)
 
 
 @every

@@ -139,8 +139,9 @@ class Case:
             return reset
         return self.make()._reset(data.empty(), reset)
 
-    def env(self, base):
-        return TransformedEnv(base, Compose(*(make() for make in self.needs), self.make()))
+    def env(self, base, **keys):
+        parts = [make(**keys) for make in (*self.needs, self.make)]
+        return TransformedEnv(base, Compose(*parts))
 
 
 mcar = partial(T.ObservationMissingness, "mcar", 0.5, seed=0)

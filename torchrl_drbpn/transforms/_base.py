@@ -118,6 +118,15 @@ def enter_new(spec: Composite, key: NestedKey, leaf: TensorSpec, owner: Transfor
     spec[key] = leaf
 
 
+def enter_state(spec: Composite, key: NestedKey, leaf: TensorSpec, like: Composite) -> None:
+    """Enter a key into the state spec, in folders of the shapes that they have in ``like``."""
+    for depth in range(1, len(key)) if isinstance(key, tuple) else ():
+        folder = key[:depth]
+        if folder not in spec.keys(True) and folder in like.keys(True):
+            spec[folder] = Composite(shape=like[folder].shape, device=like.device)
+    spec[key] = leaf
+
+
 def environment_of(transform: Transform) -> EnvBase | None:
     """Return the environment that holds the transform, if any does."""
     try:
@@ -315,10 +324,10 @@ class CorruptingTransform(Transform, ABC):
             other = type(earlier).__name__
             if keys.isdisjoint([*earlier.in_keys, *earlier.out_keys]):
                 continue
-            if self.writes_mask and getattr(earlier, "fills", False):
+            if getattr(earlier, "fills", False):
                 raise ValueError(
-                    f"`{other}` stands before `{name}`: what goes missing afterwards is never "
-                    f"filled. Put `{other}` after `{name}`."
+                    f"`{other}` stands before `{name}`, which leaves 0 where nothing arrived: what "
+                    f"was filled is lost. Put `{other}` after `{name}`."
                 )
             corrupts = isinstance(earlier, CorruptingTransform) and not earlier.keeps_readings
             if self.complete_keys and corrupts:

@@ -16,6 +16,7 @@ from torchrl_drbpn.transforms._base import (
     as_key_list,
     check_count,
     enter_new,
+    enter_state,
     read_numbers,
     sibling_key,
 )
@@ -153,8 +154,9 @@ class CarriedStateTransform(SeededTransform):
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         """Enter the states as what a step reads."""
-        for key, leaf in self._state_specs(self.parent.full_observation_spec):
-            state_spec[key] = leaf
+        observed = self.parent.full_observation_spec
+        for key, leaf in self._state_specs(observed):
+            enter_state(state_spec, key, leaf, observed)
         return state_spec
 
 

@@ -11,6 +11,7 @@ from torchrl_drbpn.transforms._base import (
     EnvironmentTransform,
     Keys,
     as_key_list,
+    enter_state,
     flagged_rows,
     pair_keys,
     read_vector,
@@ -120,7 +121,9 @@ class FillLastObserved(EnvironmentTransform):
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
         """Enter the last values as a state that a step reads."""
+        observed = self.parent.full_observation_spec
         for key, _, _, state_key in self._keys:
-            leaf = self.parent.full_observation_spec[key]
-            state_spec[state_key] = Unbounded(leaf.shape, leaf.device, leaf.dtype)
+            leaf = observed[key]
+            last = Unbounded(leaf.shape, leaf.device, leaf.dtype)
+            enter_state(state_spec, state_key, last, observed)
         return state_spec
