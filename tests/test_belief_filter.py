@@ -189,6 +189,13 @@ def test_bad_input_is_one_clear_line(method, name, value, message):
         getattr(model, method)(*inputs)
 
 
+def test_a_start_that_is_no_number_is_named():
+    data, model = sequences(3), BeliefFilter(OBS, ACTION, 3, covariance="propagated").double()
+    inputs = data._replace(cov=torch.full((3, 3, 3), torch.nan, dtype=F64))
+    with pytest.raises(ValueError, match="`cov` holds NaN or inf: the filter cannot start"):
+        model(*inputs)
+
+
 def test_the_check_of_readings_can_be_off():
     inputs = sequences(3)
     inputs.observation[1, 2, 4] = torch.nan  # frame 2 has arrived whole

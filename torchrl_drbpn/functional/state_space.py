@@ -220,8 +220,8 @@ class StateSpace:
         own, flag, steps = self.emission_matrix.dtype, torch.bool, tuple(given.reset.shape)
         wanted: dict[str, tuple[torch.dtype, str, tuple[int, ...]]] = {
             "reset": (flag, "", steps),
-            "observed": (flag, " obs", (*steps, obs)),
             "observation": (own, " obs", (*steps, obs)),
+            "observed": (flag, " obs", (*steps, obs)),
             "previous_action": (own, " action", (*steps, action)),
             "mean": (own, " state", (*start, state)),
             "use_stored_state": (flag, "", steps),
