@@ -1,12 +1,6 @@
 """Pure tensor maths of the belief filter and of the corruption; torch alone."""
 
-from torchrl_drbpn.functional.calibration import (
-    Consistency,
-    chi_square_quantile,
-    consistency,
-    nees,
-    nis,
-)
+from torchrl_drbpn.functional.calibration import nees, nis
 from torchrl_drbpn.functional.filtering import (
     FilterOutput,
     filter_sequence,
@@ -57,7 +51,6 @@ from torchrl_drbpn.functional.state_space import StateSpace, TransitionMLP, pred
 
 __all__ = [
     "Belief",
-    "Consistency",
     "DiagonalGaussian",
     "FilterOutput",
     "Forecast",
@@ -71,8 +64,6 @@ __all__ = [
     "SensorSelection",
     "StateSpace",
     "TransitionMLP",
-    "chi_square_quantile",
-    "consistency",
     "draw_mechanism",
     "filter_sequence",
     "filter_step",
