@@ -1,6 +1,5 @@
 """Choose sensors: the components whose readings leave the belief least uncertain."""
 
-from collections.abc import Sequence
 from numbers import Integral
 from typing import Literal, NamedTuple
 
@@ -18,11 +17,11 @@ class SensorSelection(NamedTuple):
 
     Args:
         indices: rows of H, best first, int64, shape ``(*batch, count)``.
-        objective: of :math:`P^+` after ``always`` and the sensors up to this one: its
-            log-determinant for "D" (nats), the trace of :math:`C P^+ C'` for "A" (squared units
-            of the target); float64, shape ``(*batch, count)``.
-        information: mutual information of the state and these readings given ``always``,
-            :math:`\tfrac12 (\log|P^+_{always}| - \log|P^+|)`, nats; float64, the same shape.
+        objective: of :math:`P^+` after the sensors up to this one: its log-determinant for "D"
+            (nats), the trace of :math:`C P^+ C'` for "A" (squared units of the target); float64,
+            shape ``(*batch, count)``.
+        information: mutual information of the state and these readings,
+            :math:`\tfrac12 (\log|P| - \log|P^+|)`, nats; float64, the same shape.
     """
 
     indices: Tensor
@@ -38,7 +37,6 @@ def select_sensors(
     count: int,
     *,
     criterion: Criterion = "D",
-    always: Sequence[int] | Sequence[bool] | Tensor = (),
     target: Tensor | None = None,
 ) -> SensorSelection:
     r"""Choose the sensors that reduce the belief's uncertainty most, one after the other.
@@ -68,13 +66,12 @@ def select_sensors(
         emission_cov: R, shape ``(*batch, obs, obs)``, or its diagonal ``(obs,)``.
         count: how many to choose.
         criterion: "D", the log-determinant, or "A", the trace.
-        always: sensors that are read in any case and not chosen: indices, or bool ``(obs,)``.
         target: C, the combinations of the state whose variances count for "A", shape
             ``(*batch, target, state)``; None: the whole state, C = I.
 
     Raises:
         ValueError: for matrices that do not fit, are not finite or no covariances, an unknown
-            criterion, or sensors that do not exist.
+            criterion, or more sensors than there are.
 
     Example:
         >>> H = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -88,13 +85,10 @@ def select_sensors(
         raise ValueError("`target` weighs the trace: it needs criterion='A', got 'D'.")
     H, P, R = _as_matrices(emission_matrix, predicted_cov, emission_cov)
     obs, batch = H.shape[-2], H.shape[:-2]
-    C, there = _as_target(target, H), _as_indices(always, obs)
-    free, whole = obs - len(there), isinstance(count, Integral) and not isinstance(count, bool)
-    if not whole or not 0 <= count <= free:
-        raise ValueError(
-            f"`count` must be an int from 0 to {free}, the sensors that are not in `always`, got "
-            f"{count!r}."
-        )
+    C = _as_target(target, H)
+    whole = isinstance(count, Integral) and not isinstance(count, bool)
+    if not whole or not 0 <= count <= obs:
+        raise ValueError(f"`count` must be an int from 0 to {obs}, all sensors, got {count!r}.")
     # Given the readings so far: covariances of (x, C s) with x, and of the noise. Both matrices
     # lose a multiple of the same row with every reading, so the first two are one.
     joint, noise = torch.cat([H @ P @ H.mT + R, C @ P @ H.mT], -2), R
@@ -102,7 +96,7 @@ def select_sensors(
     information = torch.zeros_like(trace)
     seen = torch.zeros(*batch, obs, dtype=torch.bool, device=H.device)
     steps = []
-    for place in range(len(there) + int(count)):
+    for _ in range(int(count)):
         # What was read has no variance left; 1 keeps the ratios defined. A reading varies at least
         # as its noise does, but for rounding.
         own = noise.diagonal(dim1=-2, dim2=-1).masked_fill(seen, 1.0)
@@ -110,14 +104,11 @@ def select_sensors(
         variance = torch.maximum(variance, own)
         gained = 0.5 * (variance / own).log()  # I(s; x_i | readings)
         lowered = joint[..., obs:, :].square().sum(-2) / variance  # by how much tr C P+ C' falls
-        if place < len(there):
-            index = torch.full((*batch, 1), there[place], device=H.device)
-        else:
-            gain = (gained if criterion == "D" else lowered).masked_fill(seen, -torch.inf)
-            tie = _TIE if criterion == "D" else _TIE * initial_trace.unsqueeze(-1)
-            # The first True: mathematically equal gains differ by rounding.
-            best = gain >= gain.amax(-1, keepdim=True) - tie
-            index = best.to(torch.uint8).argmax(-1, keepdim=True)
+        gain = (gained if criterion == "D" else lowered).masked_fill(seen, -torch.inf)
+        tie = _TIE if criterion == "D" else _TIE * initial_trace.unsqueeze(-1)
+        # The first True: mathematically equal gains differ by rounding.
+        best = gain >= gain.amax(-1, keepdim=True) - tie
+        index = best.to(torch.uint8).argmax(-1, keepdim=True)
         information = information + gained.gather(-1, index).squeeze(-1)
         trace = trace - lowered.gather(-1, index).squeeze(-1)
         seen = seen.scatter(-1, index, True)
@@ -129,9 +120,7 @@ def select_sensors(
     indices, traces, informations = (torch.stack(part, -1) for part in zip(*steps, strict=True))
     log_det = torch.linalg.slogdet(P).logabsdet.unsqueeze(-1)
     objective = log_det - 2.0 * informations if criterion == "D" else traces
-    if there:
-        informations = informations - informations[..., len(there) - 1 : len(there)]
-    return SensorSelection(*(x[..., len(there) :] for x in (indices, objective, informations)))
+    return SensorSelection(indices, objective, informations)
 
 
 def _without(cov: Tensor, index: Tensor) -> Tensor:
@@ -191,20 +180,3 @@ def _as_target(C: Tensor | None, H: Tensor) -> Tensor:
             f"the batch shape {tuple(batch)} of the model or none, got {tuple(C.shape)}."
         )
     return C.expand(*batch, *C.shape[-2:])
-
-
-def _as_indices(always: Sequence[int] | Sequence[bool] | Tensor, obs: int) -> list[int]:
-    """Return the indices of the sensors that are always read, each once, in order."""
-    tensor = torch.as_tensor(always)
-    if tensor.numel() == 0 and tensor.dtype != torch.bool:
-        return []
-    flags = tensor.dtype == torch.bool
-    if tensor.ndim != 1 or tensor.is_floating_point() or (flags and len(tensor) != obs):
-        raise ValueError(
-            f"`always` must be a list of indices, or {obs} bools, True for a sensor that is always "
-            f"read, got {always!r}."
-        )
-    indices = tensor.nonzero().flatten() if flags else tensor
-    if bool(((indices < -obs) | (indices >= obs)).any()):
-        raise ValueError(f"`always` must hold indices from {-obs} to {obs - 1}, got {always!r}.")
-    return sorted({int(i) % obs for i in indices})
