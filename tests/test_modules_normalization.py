@@ -224,11 +224,10 @@ def test_the_state_survives_a_file_read_without_running_code():
 @pytest.mark.parametrize(
     ("name", "value", "match"),
     [
-        ("mean", torch.zeros(4), r"0\.mean` must have shape \(3,\), got \(4,\)"),
-        ("var", torch.tensor([1.0, -1, 1]), r"`module\.0\.var` must be finite and at least 0"),
-        ("var", torch.tensor([1.0, torch.inf, 1]), r"0\.var` must be finite"),
-        ("mean", torch.tensor([1.0, torch.nan, 1]), r"0\.mean` must be finite, got nan"),
-        ("count", torch.tensor([1, -1, 1]), r"0\.count` must be finite and at least 0, got -1"),
+        ("var", torch.tensor([1.0, -1, 1]), r"`module\.0\.var` holds -1\.0: that is no statistic"),
+        ("var", torch.tensor([1.0, torch.inf, 1]), r"0\.var` holds inf"),
+        ("mean", torch.tensor([-1.0, torch.nan, 1]), r"0\.mean` holds nan"),
+        ("count", torch.tensor([1, -1, 1]), r"0\.count` holds -1"),
     ],
 )  # fmt: skip
 def test_statistics_that_are_none_are_refused_at_load(name, value, match):

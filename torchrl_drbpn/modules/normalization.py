@@ -223,22 +223,13 @@ class MaskedObservationNorm(TensorDictModuleBase):
         return found[0], found[1] if len(found) == 2 else None
 
 
-def _refuse_unusable(
-    module: MaskedObservationNorm, state_dict: Mapping[str, Any], prefix: str, *_: Any
-) -> None:
-    """Refuse statistics of another robot, and those that are no statistics."""
-    for name in ("count", "mean", "var"):
-        value = state_dict.get(prefix + name)
-        if value is None:
-            continue  # load_state_dict itself says what is missing
-        if value.shape != (module.obs_dim,):
+def _refuse_unusable(_: Any, state_dict: Mapping[str, Any], prefix: str, *__: Any) -> None:
+    """Refuse numbers that are no statistics; torch itself refuses those of another shape."""
+    for name, least in (("count", 0), ("mean", -math.inf), ("var", 0)):
+        value = state_dict.get(prefix + name, torch.zeros(0))
+        bad = value[~(value.isfinite() & (value >= least))]
+        if len(bad):
             raise ValueError(
-                f"`{prefix}{name}` must have shape ({module.obs_dim},), got {tuple(value.shape)}: "
-                "these are the statistics of other observations."
-            )
-        usable = value.isfinite() if name == "mean" else value.isfinite() & (value >= 0)
-        if not bool(usable.all()):
-            raise ValueError(
-                f"`{prefix}{name}` must be finite{'' if name == 'mean' else ' and at least 0'}, "
-                f"got {value[~usable][0].item()}: these are no statistics. Is the file damaged?"
+                f"`{prefix}{name}` holds {bad[0].item()}: that is no statistic of readings. Is the "
+                "file damaged?"
             )
