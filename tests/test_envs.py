@@ -168,7 +168,7 @@ COUNTS = [(name, value) for name in ("num_envs", "num_threads", "max_episode_ste
 )  # fmt: skip
 def test_bad_input_is_refused_in_one_line(backend, kwargs, use, error, message):
     with pytest.raises(error, match=message) as caught:
-        use(backend(**{"env_id": "Swimmer-v5", "num_envs": 1, **kwargs}))
+        use(backend(**{"env_id": "Swimmer-v5", "num_envs": np.int64(1), **kwargs}))
     assert "\n" not in str(caught.value)
 
 

@@ -69,7 +69,8 @@ def read_table(path: Path, needed: Iterable[str], **options: Any) -> pd.DataFram
         ended = io.StringIO(text[: text.rfind("\n") + 1])
         table = pd.read_csv(ended, keep_default_na=False, na_values=[""], **options)
     except (OSError, ValueError) as error:
-        raise UserError(f"`{path}` can't be read as a table: is it damaged?") from error
+        why = "is it damaged?" if path.exists() else "it is not there."
+        raise UserError(f"`{path}` can't be read as a table: {why}") from error
     if absent := [name for name in needed if name not in table]:
         raise UserError(f"`{path}` lacks the columns {', '.join(absent)}: is it another table?")
     return table

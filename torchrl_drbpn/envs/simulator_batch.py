@@ -5,6 +5,7 @@ A batch pays TorchRL's per-step Python once for all of its simulators.
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any, NamedTuple, NoReturn
 
 import gymnasium
@@ -56,8 +57,9 @@ class SimulatorBatch(EnvBase):
         if max_episode_steps not in (None, -1):
             counts["max_episode_steps"] = max_episode_steps
         for name, value in counts.items():
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
                 raise ValueError(f"`{name}` must be an integer of at least 1, got {value!r}.")
+        num_envs, num_threads = int(num_envs), int(num_threads)  # NumPy's have other names
         if dtype not in (torch.float32, torch.float64):
             raise TypeError(f"`dtype` must be torch.float32 or torch.float64, got {dtype}.")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
@@ -112,10 +114,12 @@ class SimulatorBatch(EnvBase):
         for name, space in (("observation", observation), ("action", action)):
             vector = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1
             if not vector or not np.issubdtype(space.dtype, np.floating):
+                joined = isinstance(space, gymnasium.spaces.Dict) and name == "observation"
+                remedy = "name the entries to join as" if joined else "a wrapper may make it one:"
                 raise ValueError(
                     f"the {name} space of `{self.env_id}` must be a vector of real numbers (a Box "
-                    f"with one dimension), got {one_line(space)}: `observation_keys` joins "
-                    "entries of a dictionary."
+                    f"with one dimension), got {one_line(space)}: {remedy} "
+                    f"`{'observation_keys' if joined else 'wrappers'}`."
                 )
         if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
             raise ValueError(
@@ -212,7 +216,7 @@ class SimulatorBatch(EnvBase):
         return TensorDict(source, batch_size=self.batch_size, device=self.device)
 
     def _words(self, seed: int) -> NDArray[Any]:
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
             raise ValueError(f"`seed` must be a non-negative integer, got {seed!r}.")
         return np.random.SeedSequence(seed).generate_state(self.num_envs)
 
