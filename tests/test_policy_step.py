@@ -234,9 +234,14 @@ def test_a_tensor_of_another_width_or_batch_is_refused_and_not_broadcast(place, 
             step(*args)
 
 
-@pytest.mark.parametrize("kind", ["innovation", "information", "network", "propagated"])
-def test_export_takes_it_with_any_batch(kind):
+@pytest.mark.parametrize(
+    ("kind", "robust"),
+    [("innovation", None), ("information", None), ("network", None), ("propagated", None),
+     ("innovation", "huber"), ("information", "imq")],
+)  # fmt: skip
+def test_export_takes_it_with_any_batch(kind, robust):
     belief, head = make(kind)
+    belief.filter.robust = robust
     limit = torch.full((ACTION,), 0.05, dtype=torch.float64)
     norm = MaskedObservationNorm(OBS)
     step = PolicyStep(belief, head, norm=norm, action_low=-limit, action_high=limit)
@@ -244,7 +249,7 @@ def test_export_takes_it_with_any_batch(kind):
     args[0][0, 0] = torch.nan
     batch = torch.export.Dim("batch", min=1, max=1024)
     exported = torch.export.export(step, args, dynamic_shapes=tuple({0: batch} for _ in args))
-    for size in (BATCH, 7):
+    for size in (BATCH, OBS, 7):
         rows = [torch.cat([x, x, x])[:size] for x in args]
         for a, b in zip(exported.module()(*rows), step(*rows), strict=True):
             torch.testing.assert_close(a, b)

@@ -69,7 +69,8 @@ def innovation_weights(
         (True, [1.0, 1.0, 1.0, 1.0])
     """
     check_observed(residual, observed)
-    if noise.shape not in (residual.shape, residual.shape[-1:]):
+    # (obs,) first: the other comparison would bar an exported batch from being as large as obs.
+    if noise.shape not in (residual.shape[-1:], residual.shape):
         raise ValueError(
             f"`noise` must be the variances (obs,) or (*batch, obs) of a diagonal R, (*batch, obs) "
             f"= {tuple(residual.shape)}, got {tuple(noise.shape)}."
