@@ -220,6 +220,8 @@ def test_an_unknown_task_has_numbers_for_names_and_a_known_one_of_another_size_i
     assert sensor_names("Pusher", "v5", 2) == ["component 0", "component 1"]
     with refused(r"`Hopper-v5` has 11 named components.* has 12"):
         sensor_names("Hopper", "v5", 12)
+    with refused(r"`Hopper-v4` has 11 named components.* has 12"):
+        sensor_names("Hopper-v4", None, 12)
 
 
 @pytest.mark.parametrize(("task", "version"), TASKS, ids=lambda value: value)

@@ -122,6 +122,12 @@ def test_a_run_is_called_by_its_belief_unless_it_is_named():
     assert method_name(make_config(*HOPPER, "belief=gru", "algo=acktr")) == "gru (acktr)"
 
 
+def test_a_task_without_a_version_of_its_own_is_called_by_its_id(tmp_path):
+    gym = [make_run(tmp_path / "a", "env=gym", "env.id=Pendulum-v1", "env.version=null")]
+    assert read_runs(gym).runs.task.item() == "Pendulum-v1"
+    assert read_runs([make_run(tmp_path / "b")]).runs.task.item() == "Hopper-v4"
+
+
 def test_points_of_one_kind_differ_in_one_number_and_are_sorted_by_it():
     assert point_kind("reduction:0.5:random") == ("reduction random", 0.5)
     assert point_kind("outages:0.5:20:joint") == ("outages 0.5 joint", 20.0)

@@ -10,6 +10,7 @@ import pandas as pd
 from evaluation.episodes import over_episodes
 from evaluation.points import faults_name, method_name, missingness_name
 from scipy.stats import hmean
+from training.envs import env_name
 from training.errors import UserError
 from training.run_folder import read_config, read_table, read_versions, write_table
 
@@ -100,10 +101,9 @@ def read_runs(
             "with the same seed: report them apart."
         )
     keys = [runs.loc[[i], RUN] for i in runs.index]
-    thinned = [_thinned(curve, rows) for curve in curves]
     joined = [
         pd.concat(key.merge(part, how="cross") for key, part in zip(keys, parts, strict=True))
-        for parts in (thinned, tested)
+        for parts in ([_thinned(curve, rows) for curve in curves], tested)
     ]
     return Study(*(table.sort_values(RUN, kind="stable") for table in (runs, *joined)))
 
@@ -122,7 +122,7 @@ def _run(
     final = bool((tested.source == "final").any() or not config["evaluation"]["final_episodes"])
     return {
         "run": folder.name,
-        "task": f"{task}-{config['env']['version']}",
+        "task": env_name(config),
         "method": method_name(config),
         "settings": "",
         "trained_on": corruption,

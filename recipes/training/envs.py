@@ -169,10 +169,10 @@ class _ClippedAction(Transform):
         return action.clamp(*self.limits)
 
 
-def env_name(config: DictConfig) -> str:
+def env_name(config: Mapping[Any, Any]) -> str:
     """Return the whole Gymnasium id of a run's task, such as ``Walker2d-v5``."""
-    env = config.env
-    return f"{env.id}-{env.version}" if env.version else str(env.id)
+    env = config["env"]
+    return f"{env['id']}-{env['version']}" if env["version"] else str(env["id"])
 
 
 def make_noise(

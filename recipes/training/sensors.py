@@ -36,8 +36,8 @@ def sensor_names(task: str, version: str | None, obs_dim: int) -> list[str]:
     names = named_sensors(task, version) or [f"component {i}" for i in range(obs_dim)]
     if len(names) != obs_dim:
         raise UserError(
-            f"`{task}-{version}` has {len(names)} named components, the observation has {obs_dim}: "
-            "is it another variant of the task?"
+            f"`{task}{f'-{version}' if version else ''}` has {len(names)} named components, the "
+            f"observation has {obs_dim}: is it another variant of the task?"
         )
     return names
 
