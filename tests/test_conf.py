@@ -52,6 +52,14 @@ def test_a_task_says_what_it_needs_and_the_command_line_wins():
     assert make_config("env=swimmer", "collector=batched").collector.num_envs == 64
 
 
+def test_a_bare_number_is_a_network_of_one_layer():
+    words = ("heads.hidden=48", "belief.transition.hidden_sizes=24", "collector.num_envs=8")
+    training, _ = assembled(*words)
+    shapes = {tuple(parameter.shape) for parameter in training.agent.parameters()}
+    assert {(48,), (24,)} < shapes
+    assert {(48, 48), (24, 24)}.isdisjoint(shapes)
+
+
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: path.stem)
 def test_every_default_is_explained_on_its_line_or_above(path):
     structure = ("defaults:", "hydra:", "_target_:", "_partial_:", "name:", "- ", "in_keys:")
@@ -99,6 +107,7 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path):
         ("seed=9223372036854775808", "`seed` must be in [0, "),
         ("threads=100000", "`threads` must be in [1, 256], got 100000"),
         ("noise.sigma=-1", "`noise.sigma` must be at least 0, got -1"),
+        ("heads.hidden=null", "`heads.hidden` must be a list such as [64, 64], got None"),
         ("optim.sequence_length=48", "`optim.sequence_length` must divide"),
         ("optim.minibatches=7", "`optim.minibatches` must divide the 8 sequences"),
         ("evaluation.modes=[best]", "`evaluation.modes` must be sampled or mean, got 'best'"),

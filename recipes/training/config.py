@@ -141,7 +141,7 @@ def _check_sizes(config: DictConfig) -> None:
 
 def _check_type(config: DictConfig, key: str, value: Any, default: Any) -> None:
     """Hold a value to the type of its default, null for any; make whole floats integers."""
-    if default is None or isinstance(default, (DictConfig, ListConfig)) or value is default:
+    if default is None or isinstance(default, DictConfig) or value is default:
         return
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if isinstance(default, bool):
@@ -150,6 +150,10 @@ def _check_type(config: DictConfig, key: str, value: Any, default: Any) -> None:
         right, wanted = number and float(value).is_integer(), "a whole number"
         if right:
             OmegaConf.update(config, key, int(value))
+    elif isinstance(default, ListConfig):
+        right, wanted = value is not None, f"a list such as {default}"
+        if not isinstance(value, ListConfig):  # a bare number or word is a list of one
+            OmegaConf.update(config, key, [value])
     elif isinstance(default, float):
         right, wanted = (number and abs(value) < inf) or default != default, "a finite number"
     else:
