@@ -31,6 +31,8 @@ from training.sensors import named_sensors
 def run(config: dict[str, Any]) -> int:
     """Evaluate what is not yet in the table, write it, and draw it; see conf/evaluate.yaml."""
     folders, protocol = find_folders(config["run"]), _protocol(config)
+    modes = config["modes"] if isinstance(config["modes"], list) else [config["modes"]]
+    check_mode("modes", *modes)
     names = [folder.name for folder in folders]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(
@@ -38,12 +40,11 @@ def run(config: dict[str, Any]) -> int:
             "evaluate each of them by itself."
         )
     output, folders = _output(config, folders), with_checkpoint(folders)
-    update = protocol.robust, protocol.robust_threshold
-    agents = {folder: load_trained_agent(folder, *update) for folder in folders}
+    agents = {f: load_trained_agent(f, protocol.robust, protocol.robust_threshold) for f in folders}
     wanted = [(f, condition) for f in folders for condition in _conditions(config, f, agents[f])]
     named = {folder.name: agent for folder, agent in agents.items()}
     table = Table(output, protocol, named, overwrite=config["overwrite"])
-    lacking = [(f, c, table.lacks(f.name, c, config["modes"])) for f, c in wanted]
+    lacking = [(f, c, table.lacks(f.name, c, modes)) for f, c in wanted]
     tasks = [task for task in lacking if task[2]]
     if len(tasks) < len(wanted):
         log_line(f"{len(wanted) - len(tasks)} of {len(wanted)} points are in {output} already")
@@ -64,10 +65,6 @@ def run(config: dict[str, Any]) -> int:
 
 def _protocol(config: dict[str, Any]) -> Protocol:
     check_limits(config, dict.fromkeys(("episodes", "processes"), (1, inf)), whole=True)
-    if not config["modes"]:
-        raise UserError("`modes` must hold sampled, mean or both, got none.")
-    for mode in config["modes"]:
-        check_mode("modes", mode)
     names = ("episodes", "seed", "reduction_seed", "threads", "robust", "robust_threshold")
     return Protocol(**{name: config[name] for name in names})
 
@@ -104,8 +101,7 @@ def _conditions(config: dict[str, Any], folder: Path, trained: TrainedAgent) -> 
     if config["full"] and not named_sensors(settings.env.id, settings.env.version):
         levels["outage_groups"] = ["sensor"]
         log_line(f"{folder.name}: outages of single sensors only, these have no names to group by")
-    texts = default_conditions(levels, full=config["full"], model=model)
-    return parse_conditions(texts, settings)
+    return parse_conditions(default_conditions(levels, full=config["full"], model=model), settings)
 
 
 def _summary(rows: pd.DataFrame) -> str:

@@ -50,6 +50,7 @@ def test_a_task_says_what_it_needs_and_the_command_line_wins():
     swimmer = make_config("env=swimmer", "method=gru")
     assert (swimmer.advantage.gamma, swimmer.collector.steps_per_env) == (0.9999, 128)
     assert make_config("env=swimmer", "collector=batched").collector.num_envs == 64
+    assert make_config("evaluation.modes=sampled").evaluation.modes == ["sampled"]
 
 
 def test_a_bare_number_is_a_network_of_one_layer():
@@ -110,6 +111,8 @@ def test_cfg_job_prints_everything_that_is_built(tmp_path):
         ("heads.hidden=null", "`heads.hidden` must be a list such as [64, 64], got None"),
         ("optim.sequence_length=48", "`optim.sequence_length` must divide"),
         ("optim.minibatches=7", "`optim.minibatches` must divide the 8 sequences"),
+        ("evaluation.modes=[]", "`evaluation.modes` must be sampled or mean, got []"),
+        ("evaluation.modes=best", "`evaluation.modes` must be sampled or mean, got 'best'"),
         ("evaluation.modes=[best]", "`evaluation.modes` must be sampled or mean, got 'best'"),
         ("missingness.always_observed=1.0", "`missingness.always_observed` must be under 1"),
         ("env=gym", "`env.id` must be given"),
@@ -211,7 +214,8 @@ COMMANDS = ("evaluate", "diagnose", "export", "play", "plot_sensors", "report", 
         ("evaluate", {"episodes": 0}, "`episodes` must be at least 1, got 0"),
         ("evaluate", {"processes": 1.5}, "`processes` must be at least 1, got 1.5"),
         ("evaluate", {"modes": ["best"]}, "`modes` must be sampled or mean"),
-        ("evaluate", {"modes": []}, "`modes` must hold sampled, mean or both"),
+        ("evaluate", {"modes": "best"}, "`modes` must be sampled or mean, got 'best'"),
+        ("evaluate", {"modes": []}, r"`modes` must be sampled or mean, got \[\]"),
         ("evaluate", {"output": "no/such/folder/x.csv"}, "`output` must lie in an existing folder"),
         ("evaluate", {"points": []}, "`points` must hold at least one"),
         ("evaluate", {"robust": "gate"}, "`robust` must be one of huber, imq, or None"),

@@ -94,7 +94,7 @@ def test_the_order_of_the_table_is_that_of_the_points_and_others_are_kept(drbpn,
     assert [row["mode"] for row in rows] == ["sampled", "sampled", "mean", "mean"] * 3
     before = out.read_bytes()
     capsys.readouterr()
-    evaluate(out, drbpn, points="none:0,'mar:0.5'", modes=["mean"])
+    evaluate(out, drbpn, points="none:0,'mar:0.5'", modes="mean")
     assert "2 of 2 points are in" in capsys.readouterr().out
     assert out.read_bytes() == before
 

@@ -104,8 +104,7 @@ def checked(config: DictConfig, overrides: Sequence[str] = ()) -> DictConfig:
             "`missingness.always_observed` must be under 1, got 1.0: nothing could go missing. "
             "Take missingness=none."
         )
-    for mode in config.evaluation.modes:
-        check_mode("evaluation.modes", mode)
+    check_mode("evaluation.modes", *config.evaluation.modes)
     return config
 
 
@@ -176,10 +175,11 @@ def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
-def check_mode(key: str, mode: str) -> None:
-    """Refuse what is not the name of a kind of action, ``sampled`` or ``mean``."""
-    if mode not in ("sampled", "mean"):
-        raise UserError(f"`{key}` must be sampled or mean, got {mode!r}.")
+def check_mode(key: str, *modes: Any) -> None:
+    """Refuse kinds of action other than ``sampled`` and ``mean``, and an empty list of them."""
+    for mode in modes or ([],):
+        if mode not in ("sampled", "mean"):
+            raise UserError(f"`{key}` must be sampled or mean, got {mode!r}.")
 
 
 def _run_folder(resume: str | None, env: str, version: str | None, belief: str, seed: int) -> str:
