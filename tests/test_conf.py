@@ -163,6 +163,9 @@ def test_missingness_has_one_name_that_reads_back():
     assert names == ["none:0", "mcar:0.5", "mar:0.5", "nmar:0.5", "outages:0.5:20:sensor",
                      "delay:2", "multi_rate:4:sensor"]  # fmt: skip
     assert missingness_name(choice("missingness", "mcar", eta=0.2)) == "mcar:0.2"
+    words = ["missingness=from_nan"], ["missingness=from_mask", "missingness.eta=0.2"]
+    names = [missingness_name(make_config(*w).missingness) for w in words]
+    assert names == ["from_nan none:0", "from_mask mcar:0.2"]  # a sensor's own gaps are no none:0
     with refused("`missingness=mcar` has no `mean_length`"):
         choice("missingness", "mcar", mean_length=3)
 

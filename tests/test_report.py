@@ -193,7 +193,8 @@ def test_settings_tasks_and_corruptions_have_means_of_their_own(tmp_path):
     for seed, folder in zip((0, 1) * len(kinds), folders, strict=True):
         config = read_config(folder)
         # What follows the seed is no difference, nor is what changes speed alone.
-        more = {"collector_seed": seed, "transforms": {"own": {"seed": seed}}}
+        own = {"_target_": "my.Dropout", "seed": seed}
+        more = {"collector_seed": seed, "transforms": {"own": own}}
         more |= {"threads": 1 + seed, "optim": config["optim"] | {"compile": bool(seed)}}
         write_config(folder, config | more)
     summary = tables(folders)["summary"]
@@ -275,6 +276,20 @@ def test_a_page_has_means_intervals_shares_and_what_diverged(tmp_path):
         assert text in page  # one of four episodes diverged
     assert "the plain mean, and the interval" in page
     assert "## Sample efficiency" in page
+
+
+def test_no_page_calls_readings_complete_that_a_transform_takes_away(tmp_path):
+    clean = ("experiment=clean", "total_frames=400")
+    chain = "{_target_: training.envs.make_outages, eta: 0.3, mean_length: 9.0, group_by: kind}"
+    kinds = [("experiment=sensor_faults", "noise=spikes"), ("missingness=from_nan", *clean)]
+    kinds += [(f"transforms.own={own}", *clean) for own in (chain, f"[{chain}]")]
+    folders = [make_run(tmp_path / f"{i}", *kind, seed=i) for i, kind in enumerate(kinds)]
+    assert read_runs(folders).runs.sort_values("seed").trained_on.tolist() == [
+        "outages:0.2254:20:sensor outages:0.2254:20:kind spikes:0.05:5",
+        "from_nan none:0",
+        *["none:0 outages:0.3:9:kind"] * 2,
+    ]
+    assert "## Sample efficiency" not in report(folders, tmp_path / "out")
 
 
 @pytest.mark.parametrize("name", ["acktr-v4-1m", "methods-v4-500k"])

@@ -113,7 +113,9 @@ def _run(
 ) -> dict[str, Any]:
     frames = int(curve.frames.max()) if len(curve) else 0
     task, noise = config["env"]["id"], config["noise"]
-    corruption = missingness_name(config["missingness"]) + faults_name(noise)
+    own = config["transforms"].get("own") or []
+    both = [config["missingness"], *(own if isinstance(own, list) else [own])]
+    corruption = " ".join(map(missingness_name, both)) + faults_name(noise)
     early = curve[(curve.frames <= WITHIN) & (curve.episodes >= 100)]
     path = folder / "episodes.csv"
     episodes = read_table(path, ["frames", "return"]) if path.is_file() else curve.head(0)
@@ -150,17 +152,14 @@ def _evaluations(
     own = read_table(path, needed) if path.is_file() else pd.DataFrame(columns=needed)
     own = own.rename(columns={"kind": "source"})
     tables = [own.assign(point=missingness_name(config["missingness"]), table=path.name)]
-    if shared is not None:
-        tables.append(_over_episodes(shared[shared.run == folder.name], "over several runs"))
     paths = [folder / name for name in EPISODE_TABLES if (folder / name).is_file()]
-    tables += [_over_episodes(read_table(path, _EPISODE), path.name) for path in paths]
+    given = {path.name: read_table(path, _EPISODE) for path in paths}
+    if shared is not None:
+        given = {"over several runs": shared[shared.run == folder.name]} | given
+    by = ["frames", "point", "mode"]
+    tables += [over_episodes(e, by).assign(source="points", table=n) for n, e in given.items()]
     rows = pd.concat([table for table in tables if len(table)] or tables)
     return rows.reindex(columns=_EVALUATION).drop_duplicates(["source", "frames", "point", "mode"])
-
-
-def _over_episodes(episodes: pd.DataFrame, table: str) -> pd.DataFrame:
-    rows = over_episodes(episodes, ["frames", "point", "mode"])
-    return rows.assign(source="points", table=table)
 
 
 def _thinned(curve: pd.DataFrame, rows: int) -> pd.DataFrame:

@@ -60,7 +60,7 @@ def condition_name(family: str, values: Mapping[str, Any]) -> str:
     """Return a condition in full, such as ``outages:0.5:20:sensor``."""
     words = [family]
     for key, *_ in FIELDS[family]:
-        value = values[key]
+        value = values.get(key)
         if value is None or value is False:
             break
         words.append(key if value is True else f"{value:g}" if type(value) is float else str(value))
@@ -79,10 +79,10 @@ def missingness_kind(node: Mapping[str, Any]) -> str:
 
 def missingness_name(node: Mapping[str, Any]) -> str:
     """Return missingness as a condition that recipes/evaluate.py reads, such as ``mcar:0.5``."""
-    kind = missingness_kind(node)
+    kind, label = missingness_kind(node), f"{node['name']} " if node.get("name") else ""
     if kind in FIELDS:
-        return condition_name(kind, node)
-    return f"{kind}:{node['eta']:g}" if "eta" in node else kind
+        return label + condition_name(kind, node)
+    return label + (f"{kind}:{node['eta']}" if "eta" in node else kind)
 
 
 def faults_name(node: Mapping[str, Any]) -> str:
