@@ -19,6 +19,7 @@ from transform_cases import CASES, COMPLETE
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 OBSERVING = {name: case for name, case in CASES.items() if name != "previous_action"}
 of_observations = pytest.mark.parametrize("case", OBSERVING.values(), ids=OBSERVING)
+CARRYING = {name: case for name, case in CASES.items() if hasattr(case.make(), "state_keys")}
 
 
 def assert_same(first, second):
@@ -264,10 +265,8 @@ def test_what_lies_under_a_false_mask_is_never_read(case):
         assert_same(results[0], results[-1])
 
 
-@of_observations
+@pytest.mark.parametrize("case", CARRYING.values(), ids=CARRYING)
 def test_what_it_carries_stands_with_the_agents_whose_sensors_they_are(case):
-    if not hasattr(case.make(), "state_keys"):
-        pytest.skip("carries nothing from step to step")
     env = case.env(AgentsEnv(), in_keys=[("agents", "observation")])
     check_env_specs(env)
     assert env.rollout(2)["agents"].batch_size == (3, 2, 2)
