@@ -122,6 +122,12 @@ def test_a_run_is_called_by_its_belief_unless_it_is_named():
     assert method_name(make_config(*HOPPER, "belief=gru", "algo=acktr")) == "gru (acktr)"
 
 
+def test_a_table_that_is_not_there_is_not_called_damaged(tmp_path):
+    folder = make_run(tmp_path / "a")
+    with refused(r"`nope\.csv` can't be read as a table: it is not there"):
+        read_runs([folder], "nope.csv")
+
+
 def test_a_task_without_a_version_of_its_own_is_called_by_its_id(tmp_path):
     gym = [make_run(tmp_path / "a", "env=gym", "env.id=Pendulum-v1", "env.version=null")]
     assert read_runs(gym).runs.task.item() == "Pendulum-v1"

@@ -101,9 +101,10 @@ def read_runs(
             "with the same seed: report them apart."
         )
     keys = [runs.loc[[i], RUN] for i in runs.index]
+    curves = [_thinned(curve, rows) for curve in curves]
     joined = [
         pd.concat(key.merge(part, how="cross") for key, part in zip(keys, parts, strict=True))
-        for parts in ([_thinned(curve, rows) for curve in curves], tested)
+        for parts in (curves, tested)
     ]
     return Study(*(table.sort_values(RUN, kind="stable") for table in (runs, *joined)))
 
@@ -115,7 +116,6 @@ def _run(
     task, noise = config["env"]["id"], config["noise"]
     own = config["transforms"].get("own") or []
     both = [config["missingness"], *(own if isinstance(own, list) else [own])]
-    corruption = " ".join(map(missingness_name, both)) + faults_name(noise)
     early = curve[(curve.frames <= WITHIN) & (curve.episodes >= 100)]
     path = folder / "episodes.csv"
     episodes = read_table(path, ["frames", "return"]) if path.is_file() else curve.head(0)
@@ -127,7 +127,7 @@ def _run(
         "task": env_name(config),
         "method": method_name(config),
         "settings": "",
-        "trained_on": corruption,
+        "trained_on": " ".join(map(missingness_name, both)) + faults_name(noise),
         "noise_sigma": float(noise["sigma"]),
         "seed": config["seed"],
         "frames": frames,

@@ -21,7 +21,8 @@ def checked(
     validate: bool,
     observation: Tensor,
     observed: Tensor,
-    **others: Tensor,
+    /,
+    **others: Tensor | None,
 ) -> _Output:
     """Filter, and raise if the result is not finite: name the input that caused it."""
     silent = not validate or torch.compiler.is_compiling() or observation.is_meta
@@ -43,7 +44,7 @@ def checked(
             return out
     refuse_readings(observation, observed)
     for name, value in others.items():
-        if not bool(torch.isfinite(value).all()):
+        if value is not None and not bool(torch.isfinite(value).all()):
             raise ValueError(
                 f"`{name}` holds NaN or inf: the filter cannot start from it. Was it written "
                 "by a policy or a filter that had diverged?"

@@ -264,9 +264,7 @@ class BeliefFilter(nn.Module):
             return filter(model, *given, **start, weight=weight, return_cov=return_cov)
 
         mean, action, *readings, _ = given
-        names = {"previous_action": action, "mean": mean, **start}
-        others = {name: value for name, value in names.items() if value is not None}
-        return checked(run, self.validate, *readings, **others)
+        return checked(run, self.validate, *readings, previous_action=action, mean=mean, **start)
 
     def forward(
         self,
